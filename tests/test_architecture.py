@@ -286,10 +286,7 @@ MOST_FLOORS_OF_FITTING = 8
 # Entry points whose options are keywords of their own; everything else takes eight arguments.
 MOST_ARGUMENTS = 8
 MAY_TAKE_MORE = 5
-SCHEDULES = {
-    *("Schedule", "Tabulated", "Constant", "NeuroFuzzy", "Adaptive"),
-    *("AdaptiveNeuroFuzzy", "RadialBasis"),
-}
+SCHEDULES = {"Schedule", "Tabulated", "Constant", "NeuroFuzzy", "Adaptive", "RBFCoefficients"}
 MOST_TESTS_FOR_CONTROLLERS = 3
 
 

@@ -75,7 +75,7 @@ def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
     options = {k: v for k, v in vars(given).items() if k not in _IRRELEVANT}
     made = Settings(
         seed=given.seed, windows=tuple(given.windows), max_steps=given.max_steps,
-        network_steps=given.max_steps, fit_plant=given.plant == "fit",
+        fit_plant=given.plant == "fit",
         origin=json.dumps(options, default=str, sort_keys=True), **settings,  # type: ignore[arg-type]
     )  # fmt: skip
     folder = given.out / "checkpoints"

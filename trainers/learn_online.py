@@ -25,7 +25,7 @@ from nfriction import fit, rollout, save
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo
 from nfriction.papers.control import study
-from nfriction.papers.nffem.correction import place_units
+from nfriction.papers.nffem.fit_rbf import place_units
 from nfriction.papers.nffem.online import OnlineNetwork, OnlineOptions, write_online
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.twin.dataset import Encoder

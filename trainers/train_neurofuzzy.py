@@ -1,15 +1,13 @@
-"""Train a neuro-fuzzy model, our ways or by the first paper's own procedure.
+"""Train a neuro-fuzzy model, our way or by the first paper's own procedure.
 
     python trainers/train_neurofuzzy.py run1.csv run2.csv --rig rig.json --model NFLFM
     python trainers/train_neurofuzzy.py --twin tlrip --model NFNLFM --procedure papers
-    python trainers/train_neurofuzzy.py --twin tlrip --model NFStribeck --procedure fit
 
-All fit the constant law first, the first two then coefficients by class of acceleration. Ours
-corrects these by an ANFIS layer with a radial basis head, on trajectories; `fit` corrects the
-constant law in the same way, and so does ours where the classes simulate no better. The papers
-span a fuzzy controller with them and train a radial basis network on its outputs for 40,000 samples
-a joint. After a Ctrl-C or a kill, `--resume` reads the stages that were finished and starts the
-others again, with the same result.
+Both fit the constant law first. Ours corrects it by an ANFIS layer with a radial basis head, on
+trajectories. The papers then fit coefficients by class of acceleration, span a fuzzy controller
+with them and train a radial basis network on its outputs for 40,000 samples a joint. After a
+Ctrl-C or a kill, `--resume` reads the stages that were finished and starts the others again, with
+the same result.
 """
 
 import sys
@@ -22,7 +20,6 @@ from nfriction.evaluation.results import model_info
 from nfriction.papers.reproduction.stages import (
     fit_by_class,
     fit_network,
-    fit_without_classes,
     network_by_controller,
 )
 
@@ -34,16 +31,15 @@ WITHOUT_CLASSES = "NFStribeck"
 def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
     parser.add_argument("--model", choices=MODELS, default="NFLFM")
-    parser.add_argument("--procedure", choices=("ours", "papers", "fit"), default="ours",
-                        help="how; fit: without classes")  # fmt: skip
+    parser.add_argument("--procedure", choices=("ours", "papers"), default="ours")
     parser.add_argument("--samples", type=int, default=40_000,
                         help="of the papers' controller, a joint")  # fmt: skip
     parser.add_argument("--terms", type=int, nargs=2, default=[5, 5], metavar="SETS",
                         help="fuzzy sets of velocity and of acceleration, ours")  # fmt: skip
     parser.add_argument("--units", type=int, default=10, help="of the radial basis network")
     given = parser.parse_args(argv)
-    if given.model == WITHOUT_CLASSES and given.procedure != "fit":
-        raise ValueError(f"{given.model} has no classes; give --procedure fit.")
+    if given.model == WITHOUT_CLASSES and given.procedure == "papers":
+        raise ValueError(f"{given.model} has no classes; give --procedure ours.")
     workspace, bench = common.start(
         given,
         controller_samples=given.samples,
@@ -51,11 +47,8 @@ def train(argv: Sequence[str] | None) -> str:
         head_units=given.units,
         network_units=given.units,
     )
-    if given.procedure == "fit":
-        return common.finish(given, bench, fit_without_classes(workspace, bench, given.model))
     if given.procedure == "ours":
-        found = fit_network(workspace, bench, given.model)
-        return common.finish(given, bench, found)
+        return common.finish(given, bench, fit_network(workspace, bench, given.model))
     law = given.model.removeprefix("NF")
     adaptive = fit_by_class(workspace, bench, f"A{law}")
     model, ended = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())

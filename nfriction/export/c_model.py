@@ -92,13 +92,13 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
     model: FrictionModel = controller.model
     # A subclass computes as it likes: only the class that names its form itself has that form.
     form = vars(type(model.schedule)).get("form", "traced")
-    network = form in ("neurofuzzy", "adaptive_neurofuzzy")
+    network = form == "neurofuzzy"
     ends = [f"{name}_{end}" for name in ("qd", "qdd") for end in ("lower", "upper")]
     ranges = torch.stack([controller.get_buffer(end) for end in ends])
     values: dict[str, Any] = {"range": ranges, "torque_limit": controller.torque_limit}
     words: dict[str, Any] = {
         "form": form, "network": network,
-        "by_class": form.startswith("adaptive"), "along_motion": False,
+        "by_class": form == "adaptive", "along_motion": False,
         "bounded": bool((ranges.abs() < UNBOUNDED).any()), "clamped": controller.clamps,
         "limited": controller.limited, "law_comment": comment(model.law.name),
         # Calls of an own exponential for many joints at once cost flash on a microcontroller.
@@ -112,7 +112,7 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
         values["constant"] = model.schedule(torch.zeros(()), torch.zeros(())).mT
     elif form == "traced":
         words["schedule"] = _schedule(controller, dialect)
-    if words["by_class"]:
+    elif form == "adaptive":
         _add_classes(model.schedule, values, words, dialect)
     if network:
         _add_network(model.schedule, values, words, dialect)
@@ -128,10 +128,9 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
 
 
 def _add_classes(
-    schedule: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
+    adaptive: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
 ) -> None:
     """Tables of the classes of acceleration."""
-    adaptive = getattr(schedule, "adaptive", schedule)
     borders = adaptive.thresholds.mT
     values |= {
         "middle": borders, "upper": borders * adaptive.band, "lower": borders / adaptive.band,
@@ -142,10 +141,9 @@ def _add_classes(
 
 
 def _add_network(
-    schedule: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
+    network: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
 ) -> None:
     """Tables of the neuro-fuzzy network."""
-    network = getattr(schedule, "deviation", schedule)
     made = tables(network)
     joints, sets, units = network.joints, made["set_slope"].shape[1], made["weights"].shape[1]
     values |= {
@@ -158,11 +156,6 @@ def _add_network(
         "unit_weight": made["weights"].permute(2, 1, 0),
         "reference": made["reference"].mT, "roundness": made["roundness"].mT,
     }  # fmt: skip
-    if words["by_class"]:
-        base = schedule.adaptive.table().transpose(0, 1)
-        reference = schedule.lifted(base)
-        values["reference"] = (0.5 * network.scale * reference).mT
-        values["offset"] = (base - network.at_reference(reference)).mT
     runs: list[tuple[int, int, bool]] = []
     for k, positive in enumerate(network.positive.tolist()):
         start = runs.pop()[0] if runs and runs[-1][2] == positive else k

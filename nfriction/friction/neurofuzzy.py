@@ -153,12 +153,8 @@ class NeuroFuzzy(Schedule):
         return torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        return self.residual_coefficients(self.reference, qd, qdd)
-
-    def residual_coefficients(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Coefficients where the network's output is added to a reference in its own units."""
         x, weight = self._clamped_inputs(qd, qdd)
-        return self.to_coefficients(reference + weight * self.network(x))
+        return self.to_coefficients(self.reference + weight * self.network(x))
 
     def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
@@ -346,9 +342,6 @@ class NeuroFuzzy(Schedule):
         mean, sd = self.prior()
         return mean, sd / self.prior_sd
 
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        return self.residual_sensitivities(self.reference, qd, qdd)
-
     @torch.no_grad()
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
@@ -387,15 +380,14 @@ class NeuroFuzzy(Schedule):
         return by_x + self.network(x)[..., None] * slope[..., None, :]
 
     @torch.no_grad()
-    def residual_sensitivities(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        """Derivatives of `residual_coefficients` at a fixed reference."""
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         anfis, head = self.network.anfis, self.network.head
         x, weight = self._clamped_inputs(qd, qdd)
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             # The map to coefficients is elementwise, so the sum's gradient is its slope.
-            u = (reference + weight * (y + head(both))).detach().requires_grad_()
+            u = (self.reference + weight * (y + head(both))).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
@@ -445,7 +437,6 @@ class NeuroFuzzy(Schedule):
 # the core does not import them.
 NETWORKS = {
     "anfis": "nfriction.friction.neurofuzzy:NeuroFuzzy",
-    "by_class": "nfriction.papers.nffem.adaptive_neurofuzzy:AdaptiveNeuroFuzzy",
     "rbf": "nfriction.papers.nffem.rbf_coefficients:RBFCoefficients",
 }
 
@@ -455,8 +446,7 @@ class NeuroFuzzyModel(NamedModel):
 
     Args:
         joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
-        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
-            a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
         inputs: what friction depends on besides speed and acceleration: `"direction"` of turning,
             `"load"` of the bearing, each by a coefficient of its own (`with_inputs`); None
             lets a fit choose those that pay.

@@ -70,7 +70,7 @@ def test_notebooks_run_from_top_to_bottom(path: Path) -> None:
     assert not any(cell.get("outputs") for cell in cells)
     known: dict[str, object] = {"__name__": "__main__"}
     for text in code:
-        exec(compile(text.replace("seconds = 10.0", "seconds = 3.0"), path.name, "exec"), known)
+        exec(compile(text.replace("seconds = 10.0", "seconds = 1.5"), path.name, "exec"), known)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

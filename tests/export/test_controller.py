@@ -14,7 +14,7 @@ from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 from tests.export.artefacts import INFO, rising
-from tests.friction.samples import motion, named_models, randomise
+from tests.friction.samples import motion, named_models
 
 MODELS = named_models()
 STATELESS = [name for name, model in MODELS.items() if not model.state_size]
@@ -120,20 +120,6 @@ def test_a_memory_goes_along_and_survives_nan(name: str) -> None:
         tau_f, _, status, after = controller(qd[k], broken, load[k], state)
         assert status.tolist() == [0, NOT_FINITE, 0]
         torch.testing.assert_close(after[1], state[1])
-
-
-def test_a_network_by_class_is_the_model_beyond_its_range_too() -> None:
-    model = NFLFM(3, network="by_class")
-    randomise(model, 0.3)
-    schedule = model.schedule
-    schedule.set_range(torch.full((3,), 9.0).double(), torch.tensor([[-90.0, 90.0]] * 3).double())
-    controller = controller_of(model, INFO)
-    qd, qdd, load = motion(500, 3)
-    state = controller.start(qd, qdd, load)
-    coefficients = controller(qd, qdd, load, state)[1]
-    memory = schedule.advance(qd, qdd, state)
-    torch.testing.assert_close(coefficients, schedule.coefficients_from(qd, qdd, memory))
-    assert (qd.abs() > 13.5).any()
 
 
 def test_the_filter_is_that_of_signals_on_differences() -> None:

@@ -175,7 +175,8 @@ def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
     assert starts["per_recording"] < 4e-4 < starts["shared"]
 
 
-@pytest.mark.parametrize("kind", [ACVFM, pytest.param(NFCVFM, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [ACVFM, NFCVFM])
 def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind):
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
@@ -217,6 +218,7 @@ def test_zeroed_is_refused_where_it_means_nothing():
         fit(CVFM(2), plant, recording, encoder_reference="per_recording", method="equation_error")
 
 
+@pytest.mark.slow
 def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)

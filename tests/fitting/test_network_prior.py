@@ -22,7 +22,7 @@ from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import StoppedError
-from nfriction.fitting.strategy.neurofuzzy import _Validation
+from nfriction.fitting.strategy.neurofuzzy import Validation
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import one_link, swing
 
@@ -48,7 +48,7 @@ def with_plant(constant):
 
 @pytest.fixture
 def sets_stay(monkeypatch):
-    monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+    monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
 
 
 @pytest.mark.usefixtures("sets_stay")
@@ -243,7 +243,7 @@ def test_a_stop_while_inputs_are_chosen_keeps_the_network_accepted(constant, mon
 
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy._with_chosen_inputs", stop)
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
-    monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+    monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     model = NFLFM(1, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 2}
     found = fit(model, one_link(), recording, start=law, **settings)
@@ -286,9 +286,9 @@ def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
         trials.append(trained_on(self, trial) if not trials else trial)
         return trials[-1]
 
-    adapt, trained_on = _Validation._adapted, _Validation.trained_on
-    monkeypatch.setattr(_Validation, "_adapted", record)
-    monkeypatch.setattr(_Validation, "trained_on", once)
+    adapt, trained_on = Validation._adapted, Validation.trained_on
+    monkeypatch.setattr(Validation, "_adapted", record)
+    monkeypatch.setattr(Validation, "trained_on", once)
     model, even = (NFNCFM(1, terms=(3, 1), head_units=1) for _ in range(2))
     found = fit(model, ARM, recording, windows=(0.5,), fit_plant=False, drag=False)
     held, moved = adapted

@@ -123,6 +123,7 @@ def short():
     return recording, fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False)
 
 
+@pytest.mark.slow
 def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_hide() -> None:
     recording = recorded((1.0, 0.33, 0.15, 1600.0, 19.4, 0.3), 0, 5.0, 500)
     begun = fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False, max_steps=0)

@@ -17,7 +17,7 @@ from nfriction.fitting.shooting import uncertainty
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.uncertainty import torque_response
-from nfriction.fitting.strategy.neurofuzzy import _Validation
+from nfriction.fitting.strategy.neurofuzzy import Validation
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import flywheel
 
@@ -45,7 +45,7 @@ def fits(swings):
     with pytest.MonkeyPatch.context() as patch:
         # Nothing is left for a network to find here; it is to be kept all the same.
         patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
-        patch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+        patch.setattr(Validation, "trained_on", lambda self, trial: trial)
         network = NFLFM(1, terms=(3, 2), head_units=2)
         return law, fit(network, *swings, start=law, **options)
 

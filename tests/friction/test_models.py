@@ -155,7 +155,6 @@ def test_nan_in_nan_out() -> None:
         ("LFM", "LFM", "none", {}),
         ("MaxwellSlip", "MaxwellSlip", "elements", {}),
         ("NFLFM", "network 'anfis'", "network, inputs, terms", {}),
-        ("NFLFM", "network 'by_class'", "memory, terms", {"network": "by_class", "terms": (2, 2)}),
     ],
 )
 def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None:
@@ -167,7 +166,6 @@ def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None
     ("given", "words"),
     [
         ({"network": "rbf", "terms": (3, 3)}, "network 'rbf' has no option terms; it has"),
-        ({"network": "by_class", "depth": 3}, "network 'by_class' has no option depth; it has"),
         ({"head_units": 2.5}, "`head_units` must be a whole number"),
         ({"inputs": "load"}, "`inputs` must be different ones of direction, load, got 'load'"),
     ],

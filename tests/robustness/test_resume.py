@@ -26,7 +26,7 @@ from nfriction.papers.reproduction.stages import reproduce
 from nfriction.papers.reproduction.workspace import Settings
 if __name__ == "__main__":
     reproduce(sys.argv[1], Settings(
-        tlrip_seconds=1.0, rtip_seconds=1.0, windows=(0.5,), max_steps=1, network_steps=1,
+        tlrip_seconds=1.0, rtip_seconds=1.0, windows=(0.5,), max_steps=1,
         controller_samples=50, search_horizon=0.5, search_evaluations=20,
         control_models=("NCFM",), control_seconds=0.5,
     ), jobs=1)

@@ -10,9 +10,7 @@
 {{ table("swing_rate", "JOINTS") }}
 /* The envelope rises to here at most: one wild value must not keep the class for long. */
 {{ table("ceiling", "JOINTS") }}
-{% if not network %}
 {{ table("by_class", 3, "COEFFICIENTS", "JOINTS") }}
-{% endif %}
 
 /* Number of borders below an envelope: the class. */
 static int nf_above(REAL envelope, const REAL border[2][NF_JOINTS], int j)

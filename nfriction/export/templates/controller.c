@@ -10,13 +10,7 @@
 /* The coefficients, which do not depend on the motion. */
 {{ table("constant", "COEFFICIENTS", "JOINTS") }}
 {% else %}
-{% if by_class %}
-{% include "adaptive.c" %}
-
-{% endif %}
-{% if network %}
-{% include "neurofuzzy.c" %}
-{% endif %}
+{% include form ~ ".c" %}
 {% endif %}
 {% if bounded %}
 
@@ -128,7 +122,7 @@ void nf_step(
                 state->memory[NF_STATE_SIZE * j + k] = next[NF_STATE_SIZE * j + k];
 {% endif %}
 {% elif network %}
-    nf_network(v, a, {{ "sign[0], " if along_motion }}{{ "known, " if by_class }}c);
+    nf_network(v, a, {{ "sign[0], " if along_motion }}c);
 {% else %}
     for (k = 0; k < NF_COEFFICIENTS; ++k)
         for (j = 0; j < NF_JOINTS; ++j)

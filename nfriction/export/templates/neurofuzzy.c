@@ -28,15 +28,8 @@
 {{ table("unit_slope", "SEEN", "UNITS", "JOINTS") }}
 {{ table("unit_shift", "SEEN", "UNITS", "JOINTS") }}
 {{ table("unit_weight", "COEFFICIENTS", "UNITS", "JOINTS") }}
-{% if by_class %}
-/* The coefficients of every class of acceleration: what the network deviates from, and what is
- * added in the end so that without a network they are as they were. */
-{{ table("reference", 3, "COEFFICIENTS", "JOINTS") }}
-{{ table("offset", 3, "COEFFICIENTS", "JOINTS") }}
-{% else %}
 /* The constant coefficients from which the network deviates. */
 {{ table("reference", "COEFFICIENTS", "JOINTS") }}
-{% endif %}
 /* A positive coefficient is u + sqrt(u^2 + ROUNDNESS), which is near 2 u or near 0; others are 2 u. */
 {{ table("roundness", "COEFFICIENTS", "JOINTS") }}
 
@@ -44,9 +37,6 @@ static void nf_network(
     const REAL qd[NF_JOINTS], const REAL qdd[NF_JOINTS],
 {% if along_motion %}
     const REAL sign[NF_JOINTS],
-{% endif %}
-{% if by_class %}
-    const int known[NF_JOINTS],
 {% endif %}
     REAL c[NF_COEFFICIENTS][NF_JOINTS])
 {
@@ -117,7 +107,7 @@ static void nf_network(
             REAL u = seen[2 + k][j];
             for (s = 0; s < NF_UNITS; ++s)
                 u += NF_UNIT_WEIGHT[k][s][j] * unit[s][j];
-            c[k][j] = NF_REFERENCE{{ "[known[j]]" if by_class }}[k][j] + trust[j] * u;
+            c[k][j] = NF_REFERENCE[k][j] + trust[j] * u;
         }
 
     /* 6. Coefficients, positive where physics has them so. */
@@ -125,12 +115,6 @@ static void nf_network(
     for (k = {{ first }}; k < {{ last }}; ++k)
         for (j = 0; j < NF_JOINTS; ++j) {
             c[k][j] += {{ "real_sqrt(nf_square(c[k][j]) + NF_ROUNDNESS[k][j])" if positive else "c[k][j]" }};
-{% if by_class %}
-            c[k][j] += NF_OFFSET[known[j]][k][j];
-{% if positive %}
-            c[k][j] = nf_max(c[k][j], 0);
-{% endif %}
-{% endif %}
         }
 {% endfor %}
 }

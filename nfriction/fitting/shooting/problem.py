@@ -55,8 +55,6 @@ class ShootingProblem:
             than a sample, and sums over many parameters dominate the time of a step.
         friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
-        memory: hidden state of the coefficients (see `Schedule`) at the start of each window,
-            (window, joint, state_size); None of a schedule without. It advances with every step.
         loss: of the errors.
         options: priors of the initial states.
     """
@@ -72,7 +70,6 @@ class ShootingProblem:
     plant_prior: tuple[Tensor, Tensor] | None = None
     offset_sd: Tensor | None = None
     extrapolation: ExtrapolationPrior | None = None
-    memory: Tensor | None = None
     loss: RobustLoss = SQUARES
     options: FitOptions = DEFAULTS
 
@@ -154,7 +151,7 @@ class ShootingProblem:
         return copy.deepcopy(self.friction)
 
     def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
+        """The windows' motion at `x`, valid until the next call; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
         model.schedule.set_parameter_vector(friction)
@@ -163,9 +160,7 @@ class ShootingProblem:
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
-        inputs = RolloutInputs(
-            q0 + offsets, qd0, held, step, hidden_state=self.memory, law_state=law_state
-        )
+        inputs = RolloutInputs(q0 + offsets, qd0, held, step, law_state=law_state)
         motion = self._integrate(self.plant_at(plant), model, inputs)
         memory = self._memory_along(model, motion) if with_memory else None
         return Trajectory(model, plant, motion, linearised, step, memory, law_slope)
@@ -184,14 +179,16 @@ class ShootingProblem:
     @torch.no_grad()
     def _memory_along(self, model: FrictionModel, motion: Rollout) -> Tensor | None:
         """Memory at every step of a motion, (window, step + 1, joint, state_size)."""
-        if self.memory is None:
+        schedule = model.schedule
+        if not schedule.state_size:
             return None
-        rows = [self.memory]
+        rows = [schedule.initial_state(motion.qd[:, 0], motion.qdd[:, 0])]
         for qd, qdd in zip(motion.qd.unbind(1)[1:], motion.qdd.unbind(1)[1:], strict=True):
-            rows.append(model.schedule.advance(qd, qdd, rows[-1]))
+            rows.append(schedule.advance(qd, qdd, rows[-1]))
         return torch.stack(rows, 1)
 
     def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
+        """Simulated less measured position in recorded coordinates, (window, step + 1, joint)."""
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 

@@ -155,10 +155,10 @@ class _Contest:
         )  # fmt: skip
         law = replace(self.free, friction=start.model, friction_prior=law_prior, extrapolation=None)
         length = start.longest_usable_horizon(options.windows)
-        self.validation = _Validation(law, start, task.motions, length)
-        self.best: _Trial | None = None
+        self.validation = Validation(law, start, task.motions, length)
+        self.best: Trial | None = None
 
-    def accepts(self, trial: "_Trial") -> bool:
+    def accepts(self, trial: "Trial") -> bool:
         """True for a network that beats the law on windows held out."""
         return gains(trial.squares, self.validation.of_law)
 
@@ -191,7 +191,7 @@ class _Contest:
         """The network trained on, or its law, written into a model of the same kind."""
         task, best, validation = self.task, self.best, self.validation
         if best is None:
-            return _constant_kept(model, self, INTERRUPTED, converged=False)
+            return self._kept(model, INTERRUPTED, converged=False)
         before, note = None, ""
         try:
             while best.finite and best is not before:
@@ -205,7 +205,7 @@ class _Contest:
         if not self.accepts(best):
             note = verdict(best.squares, validation.of_law)
         if note:
-            return _constant_kept(model, self, note, converged=not end.stopped)
+            return self._kept(model, note, converged=not end.stopped)
         found = copy.deepcopy(end.problem.friction)
         result = result_from_shooting(found, end.problem, end.result, task.motions)
         model.load_state_dict(found.state_dict())
@@ -219,6 +219,11 @@ class _Contest:
             status=result.status + moved,
             effective_parameters=effective_parameters(end),
         )
+
+    def _kept(self, model: FrictionModel, note: str, *, converged: bool) -> FitResult:
+        revert_to_constant(self.network, self.start, self.task.options)
+        model.load_state_dict(self.network.state_dict())
+        return constant_kept(self.start, model, note, converged=converged)
 
 
 def input_range(
@@ -322,7 +327,7 @@ def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ..
 
 
 @dataclass(frozen=True)
-class _Trial:
+class Trial:
     """A model trained on the windows of the first split, and its priors.
 
     Its squared errors are those on windows held out: of the first split, or of all once judged.
@@ -347,7 +352,7 @@ class _Trial:
         return network_evidence(self.end).occam - float(self.end.result.cost)
 
 
-class _Validation:
+class Validation:
     """Networks judged against a constant law on hold-out windows of one length [s]."""
 
     def __init__(
@@ -371,12 +376,12 @@ class _Validation:
     def of_law(self) -> Tensor:
         """Squared errors of the law on each window held out, (window,)."""
         values = self.law.friction.schedule.parameter_vector()
-        return self._judged(self._trial(self.law, values, "constant law, hold-out")).squares
+        return self.judged(self.trial(self.law, values, "constant law, hold-out")).squares
 
-    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial:
+    def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The best of all priors; wider plant priors must earn their place."""
         assert len(self.of_law)  # the law first: a network cannot be judged without it
-        best: _Trial | None = None
+        best: Trial | None = None
         for fitter in fitters:
             schedule = cast("NeuroFuzzy", fitter.friction.schedule)
             # From zero: from another prior's end a network would stay there.
@@ -385,15 +390,15 @@ class _Validation:
             for share in self.options.prior_shares:
                 sd = share * schedule.prior_sd
                 under = replace(fitter, friction_prior=(zeros, torch.full_like(zeros, sd)))
-                trial = self._trial(under, zeros, "network, hold-out")
+                trial = self.trial(under, zeros, "network, hold-out")
                 trials.append(replace(trial, prior_sd=sd))
-            found = self._judged(min(trials, key=lambda trial: float(trial.squares.sum())))
+            found = self.judged(min(trials, key=lambda trial: float(trial.squares.sum())))
             if best is None or gains(found.squares, best.squares):
                 best = found
         assert best is not None
         return best
 
-    def trained_on(self, trial: _Trial) -> _Trial:
+    def trained_on(self, trial: Trial) -> Trial:
         """A trial trained on at the noise that it left, or itself where that gains too little.
 
         Beside the law's error as noise, sets could hardly move. They move if the evidence favours
@@ -411,12 +416,12 @@ class _Validation:
         moved = self._adapted(held, noise, stride, learn_sets=True)
         gained = moved.log_evidence - held.log_evidence
         better = moved if gained > self.options.evidence_gain else held
-        judged = self._judged(replace(better, squares=self._errors(better.end)))
+        judged = self.judged(replace(better, squares=self._errors(better.end)))
         if gains(judged.squares, trial.squares):
             return judged
         return judged if explained and not gains(trial.squares, judged.squares) else trial
 
-    def _adapted(self, trial: _Trial, noise: float, stride: int, *, learn_sets: bool) -> _Trial:
+    def _adapted(self, trial: Trial, noise: float, stride: int, *, learn_sets: bool) -> Trial:
         """A trial trained on, the prior of each group tightened as far as evidence favours it.
 
         It is never widened: beyond it the model of the errors is not quadratic in the sets.
@@ -446,7 +451,7 @@ class _Validation:
             sd = sd * network_evidence(end).precision.clamp_min(1.0).rsqrt()[groups]
         return best or found
 
-    def fit_all(self, trial: _Trial) -> HorizonResult:
+    def fit_all(self, trial: Trial) -> HorizonResult:
         """The network of a trial, fitted to all windows."""
         return self._further(trial, self.windows, f"{self.length:g} s windows")
 
@@ -465,19 +470,19 @@ class _Validation:
         worse = 100 * (float(ratio.sqrt()) - 1)
         return LOST.format(windows.length, worse) if worse > 0 else ""
 
-    def _further(self, trial: _Trial, windows: Windows, name: str) -> HorizonResult:
+    def _further(self, trial: Trial, windows: Windows, name: str) -> HorizonResult:
         """The network of a trial, fitted to other windows from where it is."""
         (friction, plant, *_), before = trial.end.parts, trial.end.problem
         problem = trial.fitter.problem(windows, before.noise_sd, friction, stride=before.stride)
         return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
 
-    def _trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> _Trial:
+    def trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> Trial:
         """A search of the first split."""
         problem = fitter.problem(self.splits[0][0], self.noise, friction, stride=self.stride)
         end = fitter.search(problem, problem.variables.start(self.plant), self.tolerance, name)
-        return _Trial(self._errors(end), fitter, end, self.tolerance)
+        return Trial(self._errors(end), fitter, end, self.tolerance)
 
-    def _judged(self, trial: _Trial) -> _Trial:
+    def judged(self, trial: Trial) -> Trial:
         """A trial with its errors on each window, by searches of the others."""
         found = [trial.squares]
         for place, (train, _) in enumerate(self.splits[1:], 1):
@@ -494,13 +499,10 @@ class _Validation:
         return squares.clamp_min(self.explained**2)
 
 
-def _constant_kept(
-    model: FrictionModel, contest: _Contest, note: str, *, converged: bool = True
+def constant_kept(
+    start: FitResult, model: FrictionModel, note: str, *, converged: bool = True
 ) -> FitResult:
-    """The constant fit as the neuro-fuzzy model's."""
-    network, start = contest.network, contest.start
-    revert_to_constant(network, start, contest.task.options)
-    model.load_state_dict(network.state_dict())
+    """The constant fit as that of a network's model, which is its law; a note gives the reason."""
     return replace(
         start,
         model=model.requires_grad_(False),

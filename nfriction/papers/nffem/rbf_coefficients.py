@@ -44,7 +44,7 @@ class RBFCoefficients(Schedule):
     """
 
     handles_range = True
-    fit_strategy = "nfriction.papers.nffem.correction:fit_rbf"
+    fit_strategy = "nfriction.papers.nffem.fit_rbf:fit_rbf"
 
     # Final, so that TorchScript takes it for a constant.
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's universe

@@ -32,6 +32,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
 from nfriction.papers.reproduction.agreement import missed_torque
+from nfriction.papers.reproduction.fresh import free_run_errors, true_positions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
@@ -86,7 +87,7 @@ def stages() -> dict[str, Stage]:
             law: constant,
             f"A{law}": Stage(by_class, partial(fitted, fit_by_class)),
             f"A{law}-pattern": Stage(by_class, partial(fitted, fit_by_pattern)),
-            f"NF{law}": Stage((f"A{law}",), partial(fitted, fit_network)),
+            f"NF{law}": Stage((law,), partial(fitted, fit_network)),
             f"NF{law}-papers": Stage((f"A{law}",), papers_way),
             f"rtip-{law}": Stage(("twin-rtip",), second_paper),
         }
@@ -195,6 +196,8 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     arrays: dict[str, Array] = {}
     for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
+    if rig == "tlrip":
+        arrays["fresh"] = true_positions(duration)
     workspace.write_arrays(name, arrays)
     found: dict[str, Any] = {
         "recordings": {label: r.digest() for label, r in made.recordings.items()}
@@ -210,7 +213,6 @@ def fit_from_start(
     name: str,
     *,
     start: FitResult | None = None,
-    max_steps: int | None = None,
     **options: Any,
 ) -> FitResult:
     """A model made with these options and fitted to trajectories, from an earlier fit or none."""
@@ -218,7 +220,7 @@ def fit_from_start(
     model = model_by_name(name)(bench.plant.joints, **options)
     return workspace.fit(name, bench, lambda step: fit(
         model, bench.plant, bench.train, windows=settings.windows,
-        max_steps=max_steps or settings.max_steps, fit_plant=settings.fit_plant, start=start,
+        max_steps=settings.max_steps, fit_plant=settings.fit_plant, start=start,
         motions=bench.train_motions, callback=step,
     ))  # fmt: skip
 
@@ -230,30 +232,11 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories.
-
-    Where the classes simulate no better, it corrects the constant law and chooses its inputs.
-    """
-    start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
-    first, *others = start.model.schedule.coefficient_sets().values()
-    if all(torch.equal(first, other) for other in others):
-        return fit_without_classes(workspace, bench, name)
-    steps = workspace.settings.network_steps
+    """A neuro-fuzzy model our way: a network corrects the constant law, on trajectories."""
+    start, settings = fit_from_start(workspace, bench, name.removeprefix("NF")), workspace.settings
     return fit_from_start(
-        workspace, bench, name, start=start, max_steps=steps, network="by_class",
-        **_sizes(workspace),
-    )  # fmt: skip
-
-
-def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model from the constant fit of its law."""
-    start = fit_from_start(workspace, bench, name.removeprefix("NF"))
-    return fit_from_start(workspace, bench, name, start=start, **_sizes(workspace))
-
-
-def _sizes(workspace: Workspace) -> dict[str, Any]:
-    settings = workspace.settings
-    return {"terms": settings.terms, "head_units": settings.head_units}
+        workspace, bench, name, start=start, terms=settings.terms, head_units=settings.head_units
+    )
 
 
 def fit_searched(
@@ -375,7 +358,12 @@ def _judged(
     """End of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    found = {"fit": ended, "scores": scores, "coefficients": coefficient_summary(model)}
+    found: dict[str, Any] = {
+        "fit": ended, "scores": scores, "coefficients": coefficient_summary(model)
+    }  # fmt: skip
+    if stage not in SECOND_PAPER:
+        true = workspace.arrays("twin-tlrip")["fresh"]
+        found["fresh"] = free_run_errors(bench.plant, model, true)
     schedule = model.schedule
     if not isinstance(schedule, Adaptive):
         return found

@@ -40,7 +40,6 @@ class Settings:
         tlrip_seconds, rtip_seconds: length of each twin's recordings; the papers took 40 and 80.
         windows: lengths of the fits' windows [s].
         max_steps: of the fits, at each length.
-        network_steps: of the neuro-fuzzy models' fits.
         terms, head_units: of the neuro-fuzzy models.
         network_units: of the papers' network.
         controller_samples: a joint, on which the papers' network learns.
@@ -57,7 +56,6 @@ class Settings:
     rtip_seconds: float = 80.0
     windows: tuple[float, ...] = (0.5, 2.0)
     max_steps: int = 30
-    network_steps: int = 8
     terms: tuple[int, int] = (5, 5)
     head_units: int = 10
     network_units: int = 10
@@ -88,7 +86,6 @@ QUICK = Settings(
     tlrip_seconds=10.0,
     rtip_seconds=10.0,
     max_steps=5,
-    network_steps=2,
     terms=(3, 3),
     head_units=5,
     controller_samples=2000,

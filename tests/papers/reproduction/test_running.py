@@ -18,7 +18,6 @@ import pytest
 
 from nfriction import NFNCFM
 from nfriction.fitting.strategy.inputs import seeing_plant
-from nfriction.friction import model_by_name
 from nfriction.papers.reproduction import stages as stages_module
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import (
@@ -88,24 +87,6 @@ def test_a_constant_model_is_fitted_judged_and_kept(workspace: Workspace) -> Non
         assert score["measured_drive"] == score["free_run"]
         assert max(score["free_run"]["joints"]) < 0.5
     assert workspace.model("NCFM").exists()
-
-
-@pytest.mark.parametrize(("high", "network"), [(1e-3, None), (2e-3, "by_class")])
-def test_a_network_corrects_the_law_where_classes_do_not_pay(
-    high: float, network: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    asked: dict[str, Any] = {}
-
-    def fitted_model(workspace: Workspace, bench: None, name: str, **options: Any) -> Any:
-        asked[name] = options
-        by_class = [[[1e-3], [1e-3], [high]]]
-        return SimpleNamespace(model=model_by_name(name)(1, by_class if name == "ANCFM" else None))
-
-    monkeypatch.setattr(stages_module, "fit_from_start", fitted_model)
-    stages_module.fit_network(Workspace(tmp_path, TINY), None, "NFNCFM")  # type: ignore[arg-type]
-    assert asked["NFNCFM"].get("network") == network
-    start = asked["NFNCFM"]["start"].model
-    assert type(start).__name__ == ("ANCFM" if network else "NCFM")
 
 
 def test_a_network_that_sees_the_bearing_load_is_judged_on_the_plant_that_knows_it(

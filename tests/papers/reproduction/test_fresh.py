@@ -1,0 +1,51 @@
+"""Fresh releases: where they start, what an error on them is, and that they can be predicted."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nfriction import NCFM
+from nfriction.papers.reproduction import fresh, tables
+from nfriction.papers.twin.dataset import Encoder, specification
+from nfriction.papers.twin.mechanics import Links, simulate
+from nfriction.plant import rigs
+from tests.papers.reproduction.test_tables import entry, workspace
+
+
+def test_errors_are_those_of_free_runs_from_the_poses() -> None:
+    true = fresh.true_positions(0.05)
+    np.testing.assert_allclose(true[:, 0], np.deg2rad(fresh.POSES))
+    plant, model = rigs.tlrip(), NCFM(3, [0.05]).requires_grad_(False)
+    ours = np.array(fresh.free_run_errors(plant, model, true), dtype=float)
+    assert ours.shape == (10, 3)
+    assert np.all((ours > 0) & (ours < 0.01))
+    # Without the first sample's offset that every later one then has, too.
+    off = np.array(fresh.free_run_errors(plant, model, true - [0.1, 0.0, 0.0]), dtype=float)
+    assert np.all(off[:, 0] > ours[:, 0])
+    lost = np.array(true)
+    lost[2, -1] = np.nan
+    assert fresh.free_run_errors(plant, model, lost)[2] == [None] * 3
+
+
+def test_a_single_wild_release_does_not_decide_the_order(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {"NCFM": 3.0, "ANCFM": 2.0, "NFNCFM": 1.0})
+    assert not [text for text in tables.order(made).broken if "NCFM" in text]
+    result = made.found("NFNCFM")
+    for wild in (99.0, None):
+        result["fresh"][0] = entry(wild, "test")["free_run"]["joints"]
+        made.finish("NFNCFM", result)
+        assert not [text for text in tables.order(made).broken if "NCFM" in text]
+        np.testing.assert_allclose(tables.fresh(made).loc["NFNCFM"], [1.0, 2.0, 3.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pose", fresh.POSES)
+def test_fresh_releases_can_be_predicted(pose: tuple[float, float, float]) -> None:
+    links, friction = Links.of(rigs.tlrip()), specification("tlrip").friction
+    count = Encoder().quantum
+    true, off = (
+        simulate(links, friction, tuple((np.deg2rad(pose) + e).tolist()), samples=10_000).q
+        for e in (0.0, count)
+    )
+    assert np.abs(off - true).max() <= 16 * count
