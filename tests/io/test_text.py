@@ -88,7 +88,7 @@ def test_titles_above_the_header_are_passed_over(tmp_path: Path, separator: str)
     title = f"Bench 7{2 * separator}\n\nsecond run\n"
     assert np.array_equal(read(tmp_path, title + written(separator, False)).q, Q)
     # A header of one word is none of a table, and numbers are no header.
-    with pytest.raises(ValueError, match="header|missing"):
+    with pytest.raises(ValueError, match=r"header|missing"):
         read(tmp_path, written(separator, False, header="time"))
 
 
