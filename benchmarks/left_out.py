@@ -16,9 +16,10 @@ from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison
-from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold, with_fitted_offsets
+from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold
 from nfriction.evaluation.parallel import dependency_levels, warm_starts
 from nfriction.evaluation.score import Score, score
+from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
@@ -231,7 +232,11 @@ class Contest:
             )  # fmt: skip
             self.spent[m] += time.process_time() - start
             self.fits[m] = found
-            left = with_fitted_offsets(found, fold.left) if in_blocks(fold) else fold.left
+            left = fold.left
+            if in_blocks(fold):
+                offsets = found.encoder_offsets
+                moved = apply_encoder_offsets(offsets, found.plant, *zip(*left, strict=True))
+                left = [TimeBlock(*pair) for pair in zip(*moved, strict=True)]
             left = [one._replace(recording=found.aligned(one.recording)) for one in left]
             self._score(m, found.plant, found.model, fold, left, into)
 

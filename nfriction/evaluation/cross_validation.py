@@ -204,26 +204,18 @@ def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
     return Motion(motion.time[mask], motion.q[mask], motion.qd[mask], motion.qdd[mask])
 
 
-def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[TimeBlock]:
-    """Blocks with the encoder offsets that a fit found in the rest, one block a recording."""
-    recordings, motions = apply_encoder_offsets(
-        found.encoder_offsets,
-        found.plant,
-        [block.recording for block in blocks],
-        [block.motion for block in blocks],
-    )
-    return [TimeBlock(*pair) for pair in zip(recordings, motions, strict=True)]
-
-
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
-    """Root mean square position error of simulations of `horizon` seconds over each block."""
-    return [
-        score(
-            found.plant, found.model, found.aligned(block.recording), horizons=(horizon,),
-            limit=False,
-        ).windows[f"{horizon:g}"].all
-        for block in with_fitted_offsets(found, blocks)
-    ]  # fmt: skip
+    """Root mean square position error of simulations of `horizon` seconds over each block.
+
+    With the encoder offsets that the fit found in the rest, one block a recording.
+    """
+    given, motions = zip(*blocks, strict=True)
+    recordings, _ = apply_encoder_offsets(found.encoder_offsets, found.plant, given, motions)
+    scores = [
+        score(found.plant, found.model, found.aligned(r), horizons=(horizon,), limit=False)
+        for r in recordings
+    ]
+    return [scored.windows[f"{horizon:g}"].all for scored in scores]
 
 
 def _candidate(

@@ -57,7 +57,7 @@ class Errors:
     """Position errors of simulations of a recording.
 
     Attributes:
-        free_run: error of one simulation, from a given state or from a lead-in of 0.2 s; behind a
+        free_run: error of one simulation, from a given state or from a lead-in of 0.2 s; after a
             gap in time it restarts from another lead-in.
         windows: error of simulations that follow each other, by horizon [s]; each starts from a
             lead-in of its own.

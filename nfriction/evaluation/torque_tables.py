@@ -347,9 +347,11 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     by more than chance explains over the blocks, by the rules for networks and for their inputs:
     what is particular to one run of few strokes is not seen again in the next.
     """
-    by_need: dict[tuple[bool, bool], list[Candidate]] = {}
+    by_need: dict[tuple[bool, bool], list[Candidate]] = {}  # memory, load
     for candidate in candidates:
-        by_need.setdefault(_need(candidate.name), []).append(candidate)
+        kind = model_by_name(candidate.name)
+        need = kind.definition.memory is not None, reads_load(kind(1))
+        by_need.setdefault(need, []).append(candidate)
     first, *others = sorted(by_need)
     chosen, why = _simplest(by_need[first])
     if others and len(by_need[first]) == 1:
@@ -365,11 +367,6 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
             gain = f"{plain_name(best.name)} has {_percent(chosen, best)} % less"
             why += f"; {gain}, which the blocks' scatter explains"
     return chosen.name, why
-
-
-def _need(name: str) -> tuple[bool, bool]:
-    """Needs of a model: memory, and a load."""
-    return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
 
 
 def _percent(more: Candidate, less: Candidate) -> str:

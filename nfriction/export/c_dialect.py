@@ -78,16 +78,13 @@ class ControllerC:
     def _initialiser(self, values: Any, indent: int) -> str:
         array = np.asarray(values, dtype=np.float64)
         if array.ndim == 1:
-            return f"{{{', '.join(self._bare(x) for x in array)}}}"
+            return f"{{{', '.join(self.literal(x).strip('()') for x in array.tolist())}}}"
         rows = [self._initialiser(row, indent + 4) for row in array]
         inline = f"{{{', '.join(rows)}}}"
         if len(inline) + indent < 100 and "\n" not in inline:
             return inline
         pad = "\n" + indent * " "
         return "{" + pad + _filled(rows, 100 - indent, pad) + "\n" + (indent - 4) * " " + "}"
-
-    def _bare(self, value: float) -> str:
-        return self.literal(float(value)).strip("()")
 
     def text(self, template: str, **words: Any) -> str:
         """A template with its words filled in."""

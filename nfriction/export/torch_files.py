@@ -199,16 +199,11 @@ def _compile(controller: Controller) -> Any:
         _Filtering if controller.filters else _Remembering if controller.remembers else _Stateless
     )
     module = kind(controller).eval()
-    methods = [name for name in _methods(module) if name != "forward"]
+    methods = [name for name in ("step", "initial_state") if hasattr(module, name)]
     try:
         return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
     except refusals as error:
         raise ExportError(f"the model does not script:\n{error}") from error
-
-
-def _methods(module: Any) -> list[str]:
-    """Names of the methods for hosts."""
-    return [name for name in ("forward", "step", "initial_state") if hasattr(module, name)]
 
 
 def pt2(

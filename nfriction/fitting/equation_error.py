@@ -261,22 +261,18 @@ def regress(
                 break
     slopes, error = regression.linearised(coefficients)
     many = kept.sum(0)
+    # Inflated for autocorrelation.
+    noise = [effective_noise(error[kept[:, j], j][None, :, None]) for j in range(len(many))]
     return TorqueFit(
         coefficients,
         (error.square().sum(0) / many).sqrt(),
         (torch.where(kept, torque, 0.0).square().sum(0) / many).sqrt(),
         starts,
         torch.stack([
-            slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
-            for j in range(len(many))
+            slopes[:, j].T @ slopes[:, j] / max(sd**2, 1e-300) for j, sd in enumerate(noise)
         ]),
         weight=torch.where(kept, regression.root.square(), 1.0),
     )  # fmt: skip
-
-
-def _effective_variance(error: Tensor) -> float:
-    """Variance of a joint's residuals, inflated for autocorrelation."""
-    return max(effective_noise(error[None, :, None]) ** 2, 1e-300)
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,8 +55,8 @@ def fit(
     `fit_adaptive` has more settings.
 
     Args:
-        model: the model to fit, changed in place; or its name, such as "coulomb-viscous": its sign
-            turns within 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
+        model: the model to fit, changed in place; or its name, such as "coulomb-viscous": v_smooth
+            is then 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
         plant: the mechanism as given, its name, or the path of a rig file.
         recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
             convention, by default the plant's.
@@ -72,7 +72,7 @@ def fit(
         encoder_reference: when incremental encoders were set to zero. `"shared"`: before all
             recordings; the offset is part of the plant. `"per_recording"`: at the start of each,
             at rest in a pose held by stiction; each recording's offset is estimated
-            (`FitResult.encoder_offsets`), and by scores that of others. `"auto"`:
+            (`FitResult.encoder_offsets`), also that of a recording to be scored. `"auto"`:
             `"per_recording"` if several recordings of a driven chain all begin at rest with every
             encoder at zero, with a warning.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model

@@ -120,7 +120,7 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     start, fading = _likeliest_start(joint, grid, every, loaded)
 
     def terms(widths: Array) -> _Dictionary:
-        z = deflections(path, widths, _approached(widths, start))
+        z = deflections(path, widths, np.clip(start / widths, -1.0, 1.0))
         return _Dictionary.of(joint, z, loaded, fading)
 
     fine = terms(grid)
@@ -138,11 +138,6 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     few = terms(widths)
     found = few.result(few.at(choice), widths, left_out[chosen], start)
     return replace(found, without=without)
-
-
-def _approached(widths: Array, path: float) -> Array:
-    """Deflections over widths after a move from rest, (width,)."""
-    return np.clip(path / widths, -1.0, 1.0)
 
 
 def _likeliest_start(

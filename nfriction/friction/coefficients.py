@@ -97,7 +97,7 @@ class Schedule(nn.Module, ABC):
         return self.advance(qd, qdd, state)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        """Coefficients at a sample, given the hidden state after it; `forward` is a first one's."""
+        """Coefficients at a sample, given the hidden state after it; `forward`: at a first one."""
         coefficients: Tensor = self(qd, qdd)
         return coefficients
 
@@ -189,7 +189,7 @@ class Tabulated(Schedule):
         shape = (joints, *cells, len(law.names))
         self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
         if initial is None:
-            # Small, yet felt: a gradient step on the logarithm of zero would not leave it.
+            # Small but not zero: a gradient step on the logarithm of zero would not leave it.
             initial = [
                 c.initial_grid[len(c.initial_grid) // 2] if c.initial_grid else 1e-3 * c.positive
                 for c in law.coefficients

@@ -13,9 +13,9 @@ Every law here is a function `(qd, load, coefficients, v_smooth) -> tau_f` of
     v_smooth      velocity over which the sign of the velocity changes [rad/s]
     tau_f         friction torque [N m], shape (*batch, joint)
 
-and scripts, exports and broadcasts. For a sliding axis read m for rad and N for N m. A law of your
-own is one such function with a description of its coefficients, a `Law`. The next step is
-`nfriction.friction.coefficients`: the coefficients as a function of the motion.
+that can be scripted by TorchScript, exported and broadcast. For a sliding axis read m for rad and N
+for N m. A law of your own is one such function with a description of its coefficients, a `Law`. The
+next step is `nfriction.friction.coefficients`: the coefficients as a function of the motion.
 
 References:
     Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), for Coulomb, viscous and
@@ -46,7 +46,7 @@ class Coefficient:
         initial_grid: start values to try where the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
         prior_scale: standard deviation of a prior around zero, relative to the RMS of the joint's
-            friction torque; infinite for none. For effects that most joints have little of.
+            friction torque; infinite for none. Meant for effects that are small in most joints.
         stores: scales the energy of a law's memory, so that networks leave it constant.
 
     Raises:
@@ -262,7 +262,7 @@ LINEAR = Law("linear", (Coefficient("B", "N m s/rad"), Coefficient("C", "N m")),
 NONLINEAR = Law(
     "nonlinear",
     (
-        # Most joints have hardly any offset, and few data seem to show one.
+        # Most joints have hardly any offset, but sparse data may suggest one.
         Coefficient("f_o", "N m", positive=False, prior_scale=0.03),
         Coefficient("f_c", "N m"),
         Coefficient("f_v", "N m s/rad"),

@@ -31,7 +31,7 @@ class FrictionModel(nn.Module):
         law: the friction law.
         schedule: its coefficients as a function of the motion.
         v_smooth: velocity over which the sign of the velocity changes, `sgn(v) = tanh(v/v_smooth)`
-            [rad/s; m/s for a sliding axis]; fits of models by name choose it for slow motions.
+            [rad/s; m/s for a sliding axis]; a fit of a model given by name chooses it itself.
 
     Shape:
         qd, qdd, load: (*batch, joint); output (*batch, joint).
@@ -80,8 +80,8 @@ class FrictionModel(nn.Module):
             )
         return self.torque(qd, load, self.schedule(qd, qdd))
 
-    # A simulation takes the torque in two steps: coefficients at a sample, which it then holds, and
-    # the torque of these at every stage of an integration step.
+    # A simulation computes the torque in two steps: the coefficients at a sample, which it holds,
+    # and the torque by these at every stage of an integration step.
 
     def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients at a motion, (*batch, joint, coefficient); see `Schedule`."""
@@ -113,7 +113,7 @@ class FrictionModel(nn.Module):
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def steady_torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
-        """The same at velocities that last: what a law with memory approaches."""
+        """Friction torque at a constant velocity, which a law with memory approaches."""
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def check_loads(self, plant: object) -> None:
@@ -123,9 +123,9 @@ class FrictionModel(nn.Module):
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
-        It decides whether an explicit integrator is stable near standstill. The largest, where
-        several sets of coefficients are possible at rest. Zero of a law with memory, for which
-        steps are implicit and stable at any slope.
+        It decides whether an explicit integrator is stable near standstill. Where several sets of
+        coefficients are possible at rest, it is the largest; for a law with memory, whose steps are
+        implicit and stable at any slope, it is zero.
         """
         if self.law_state_size:
             return self.schedule.positive.new_zeros(self.joints, dtype=torch.float64)
@@ -171,7 +171,7 @@ class NamedModel(FrictionModel):
         v_smooth: float = V_SMOOTH,
         **options: Any,
     ) -> None:
-        # What a class takes by a name of its own comes with the schedule's options.
+        # Keyword arguments of the class itself arrive among the options of the schedule.
         given = signature(type(self)).parameters.values()
         own = [p.name for p in given if p.kind is p.KEYWORD_ONLY and p.name != "v_smooth"]
         require_options(type(self).__name__, self.make_schedule, options, own)

@@ -94,7 +94,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
     # The nearer zero keeps `angle_offset` small, and often exactly zero.
     hanging = math.cos(flat.angle[0] - hinged[0].reading) < 0
     turns = np.diff([math.pi * hanging, *flat.angle])
-    offset = [_turned(turn - k.reading) for turn, k in zip(turns, hinged, strict=True)]
+    offset = [math.remainder(t - k.reading, math.tau) for t, k in zip(turns, hinged, strict=True)]
     tensors = np.array([_tensor(b.inertia, a, plane, z) for b, a in
                         zip(bodies, flat.angle, strict=True)])  # fmt: skip
     mass = [body.mass for body in bodies]
@@ -254,11 +254,6 @@ def _carried(
 def _tilt(one: Array, other: Array) -> float:
     """Angle between two axes, whichever way they point [rad], 0 to pi/2."""
     return math.atan2(float(np.linalg.norm(np.cross(one, other))), abs(float(one @ other)))
-
-
-def _turned(angle: float) -> float:
-    """An angle within half a turn of zero."""
-    return math.remainder(angle, math.tau)
 
 
 def _refuse(joint: str, why: str) -> NoReturn:

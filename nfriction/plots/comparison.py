@@ -298,16 +298,13 @@ def _label(name: str, score: Score) -> str:
 def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> None:
     """The value above a bar, upright; in words where there is none."""
     inside = np.isinf(value)
-    text = "diverged" if inside else ("n/a" if np.isnan(value) else _digits(value))
+    digits = f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
+    text = "diverged" if inside else "n/a" if np.isnan(value) else digits
     ax.annotate(
         text, (x, top if inside else max(np.nan_to_num(value), bottom)), rotation=90,
         xytext=(0, -3 if inside else 2), textcoords="offset points",
         ha="center", va="top" if inside else "bottom", fontsize=style.TINY, color=style.INK,
     )  # fmt: skip
-
-
-def _digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
 
 
 def _intervals(found: FitResult, name: str, k: int) -> Array:

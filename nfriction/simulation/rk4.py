@@ -86,11 +86,11 @@ def simulate_eager(
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint).
 
-    Of a law with memory also its state, (*batch, steps + 1, joint, state).
+    For a law with memory also its state, (*batch, steps + 1, joint, state).
     """
     q, qd, tau = inputs.q0, inputs.qd0, inputs.tau
     step = inputs.step / inputs.substeps
-    # Nothing is known of friction before the first step, so that acceleration leaves it out.
+    # Nothing is known of friction before the first step, so this acceleration leaves it out.
     qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
     internal = [] if inputs.law_state is None else [inputs.law_state]
     states = [(q, qd, qdd, *internal)]

@@ -66,8 +66,8 @@ def rollout(
     Args:
         plant: the mechanism, e.g. `rigs.tlrip()`.
         friction: friction model, or None for no friction.
-        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint); like all
-            tensors here also NumPy arrays or lists, which are float64 unless an array says else.
+        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint). Like all
+            tensors here they may be arrays, which keep their precision, or lists, read as float64.
         tau: joint torque [N m] held over each step, (steps, joint) or (*batch, steps, joint).
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
         steps: number of samples after the first; optional where `tau` or `sample_time` gives it.

@@ -66,10 +66,10 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch, caplog):
     given = samples(joints, k, len(terms), memory=joints * size)
     compiled = StepJacobian(plant, model, terms)
     assert not caplog.records
-    found = compiled(*given)
+    found = compiled.after_step(*given)
     eager = without_compiler(monkeypatch, plant, model, terms)
     assert "eager torch" in caplog.text
-    torch.testing.assert_close(found, eager(*given), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(found, eager.after_step(*given), rtol=1e-10, atol=1e-10)
 
     def after(state, held, vector, tau, step):
         moved = plant.replace(**adjusted_buffers(plant, terms, vector))
@@ -92,19 +92,18 @@ def test_eager_pieces_do_not_show(monkeypatch):
     plant, model = LinearAxis(2.0), model_by_name("NCFM")(1)
     terms = plant_parameters(plant, driven=(0,), largest_torque=1.0)
     given = samples(1, 1, len(terms), count=CHUNK + 3)
-    found = without_compiler(monkeypatch, plant, model, terms)(*given)
-    torch.testing.assert_close(found, StepJacobian(plant, model, terms)(*given), rtol=1e-10,
-                               atol=1e-12)  # fmt: skip
+    found = without_compiler(monkeypatch, plant, model, terms).after_step(*given)
+    whole = StepJacobian(plant, model, terms).after_step(*given)
+    torch.testing.assert_close(found, whole, rtol=1e-10, atol=1e-12)
 
 
 def test_a_plant_may_have_no_adjustable_terms(monkeypatch):
     plant, model = pendulum(), LFM(2, v_smooth=0.5)
     given = samples(2, 2, 0)
-    found = StepJacobian(plant, model, [])(*given)
+    found = StepJacobian(plant, model, []).after_step(*given)
     assert found.shape == (5, 6, 8)
-    torch.testing.assert_close(
-        found, without_compiler(monkeypatch, plant, model, [])(*given), rtol=1e-10, atol=1e-10
-    )
+    eager = without_compiler(monkeypatch, plant, model, [])
+    torch.testing.assert_close(found, eager.after_step(*given), rtol=1e-10, atol=1e-10)
 
 
 def test_the_start_slope_is_the_frictionless_acceleration_s():

@@ -151,7 +151,7 @@ class ShootingProblem:
         return copy.deepcopy(self.friction)
 
     def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
+        """The windows' motion at `x`, valid until the next call; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
         model.schedule.set_parameter_vector(friction)
@@ -188,6 +188,7 @@ class ShootingProblem:
         return torch.stack(rows, 1)
 
     def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
+        """Simulated less measured position in recorded coordinates, (window, step + 1, joint)."""
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 

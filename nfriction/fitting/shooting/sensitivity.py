@@ -43,6 +43,16 @@ class StepJacobian:
         plant: the mechanism as given.
         friction: the friction model; only its law matters here.
         terms: adjustable terms of the plant.
+
+    Attributes:
+        after_step: derivatives (sample, row, direction) of the state (q, qd, that of a law with
+            memory) and the acceleration after a step, as a function of state, held coefficients,
+            torque, step and plant terms. Directions: state, held coefficients (joint-major), plant
+            terms. Where the torque's delay is one of the terms, the torque is that at no delay,
+            then its slope over the delay.
+        initial_acceleration: derivatives (window, joint, direction) of the first acceleration,
+            which has no friction, by q, qd and plant terms, as a function of q, qd, torque (window,
+            joint) and plant terms.
     """
 
     def __init__(
@@ -62,26 +72,8 @@ class StepJacobian:
             # A stiff contact would magnify the rounding that compiled code is checked against.
             held = 0.5 + 50.0 * held
         state = torch.cat([q, qd, 1e-3 * held.new_ones(joints * friction.law.state_size)])
-        self._by_step = _jacobian(self._step, [state, held, tau, step, vector], (0, 1, 4))
-        self._by_start = _jacobian(self._start, [q, qd, tau, vector], (0, 1, 3))
-
-    def __call__(
-        self, state: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
-    ) -> Tensor:
-        """Derivatives of the state and the acceleration after a step, (sample, row, direction).
-
-        The state is q, qd and that of a law with memory. Directions: state, held coefficients
-        (joint-major), plant terms. Where the torque's delay is one of the terms, `tau` is the
-        torque at no delay, then its slope over the delay.
-        """
-        return self._by_step(state, held, tau, step, vector)
-
-    def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
-        """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
-
-        `q`, `qd` and `tau` are (window, joint); the result is (window, joint, direction).
-        """
-        return self._by_start(q, qd, tau, vector)
+        self.after_step = _jacobian(self._step, [state, held, tau, step, vector], (0, 1, 4))
+        self.initial_acceleration = _jacobian(self._start, [q, qd, tau, vector], (0, 1, 3))
 
     def _start(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
         plant = adjusted_plant(self.plant, self.terms, vector)
@@ -193,7 +185,7 @@ def propagate(
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
         held, slope = _coefficients(run.friction, qd, qdd, memory)
-        derivative = jacobian(before, held, tau, step, run.plant_vector)
+        derivative = jacobian.after_step(before, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
             for part in _compose(slope, derivative, length, plant_count)

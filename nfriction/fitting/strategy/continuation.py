@@ -142,39 +142,34 @@ class ShootingFitter:
         `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
         the callback. A robust loss without a scale gets that of the errors in the end.
         """
-        if self.options.loss == problem.loss.name:
-            return self._minimise(problem, start, tolerance, name)
-        found = self._minimise(problem.rescaled(start), start, tolerance, name)
-        for _ in range(self.options.most_scales - 1):
-            again = found.problem.rescaled(found.result.x)
-            if found.stopped or again.loss.is_near(
-                found.problem.loss, self.options.scale_tolerance
-            ):
-                break
-            found = self._minimise(again, found.result.x, tolerance, name)
-        return found
-
-    def _minimise(
-        self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
-    ) -> HorizonResult:
+        options, x = self.options, start
         solver = LevenbergMarquardt(
-            max_steps=self.options.max_steps,
-            gradient_tolerance=self.options.gradient_tolerance,
+            max_steps=options.max_steps,
+            gradient_tolerance=options.gradient_tolerance,
             cost_tolerance=tolerance,
-            step_tolerance=self.options.step_tolerance,
+            step_tolerance=options.step_tolerance,
         )
         lower, upper = problem.variables.bounds()
-        monitor = StallMonitor(problem, tolerance, self.options)
 
         def report(x: Tensor, local: Quadratic, step: Step) -> Status | None:
             if self.callback is not None and self.callback(name, step):
                 return "stopped"
             return monitor(x, local, step)
 
-        result = solver.minimise(
-            problem.linearise, start, cost=problem.cost, lower=lower, upper=upper, callback=report
-        )
-        return HorizonResult(problem, result)
+        scaled = options.loss == problem.loss.name
+        problem = problem if scaled else problem.rescaled(x)
+        for _ in range(1 if scaled else options.most_scales):
+            monitor = StallMonitor(problem, tolerance, options)
+            result = solver.minimise(
+                problem.linearise, x, cost=problem.cost, lower=lower, upper=upper, callback=report
+            )
+            found, x = HorizonResult(problem, result), result.x
+            if scaled or found.stopped:
+                break
+            problem = problem.rescaled(x)
+            if problem.loss.is_near(found.problem.loss, options.scale_tolerance):
+                break
+        return found
 
 
 class StallMonitor:
