@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from nfriction.cli import demo, estimate, export, inspect, torque
 from nfriction.cli.console import (
     Commands,
+    FirstOfItsKind,
     Parser,
     UsageError,
     drop_output,
@@ -98,6 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     console = logging.StreamHandler()
     console.setLevel(logging.WARNING)  # a log file may hold more
+    console.addFilter(FirstOfItsKind())
     logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", handlers=[console])
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)

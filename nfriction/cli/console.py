@@ -120,6 +120,20 @@ def drop_output() -> int:
     return 128 + 13  # SIGPIPE, which not every system has
 
 
+class FirstOfItsKind(logging.Filter):
+    """Passes a message once: thousands of simulations of a search may diverge."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """True for the first message of its kind, whatever its numbers."""
+        first = record.msg not in self.seen
+        self.seen.add(record.msg)
+        return first
+
+
 @contextmanager
 def one_line_warnings() -> Iterator[None]:
     """Print Python's warnings as the command line's own."""

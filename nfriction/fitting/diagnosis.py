@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.fitting.result.paired_test import student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
@@ -26,6 +27,10 @@ Array = NDArray[np.float64]
 
 # Samples of a block that show a curvature despite their noise.
 FEWEST_FOR_CURVATURE = 5
+# Of fewer blocks, one of the corrections explains most by chance.
+FEWEST_BLOCKS = 20
+# Speeds between which a friction torque is linear.
+SPEED_KNOTS = 5
 
 
 @dataclass(frozen=True)
@@ -44,12 +49,16 @@ class Mistake:
 
 @dataclass(frozen=True)
 class _Data:
-    """Samples in joint coordinates, (sample, joint) each, in blocks of equal length."""
+    """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
+
+    `time` is that since the start of a recording [s], (sample, 1).
+    """
 
     q: Tensor
     qd: Tensor
     qdd: Tensor
     tau: Tensor
+    time: Tensor
     block: int
 
     def mean(self, values: Tensor) -> Tensor:
@@ -92,7 +101,7 @@ def likely_mistakes(
         do not distinguish them, none where no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
-    if not len(given.q):
+    if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
     delay = 0.0, sound
@@ -210,15 +219,17 @@ def _collect(
     parts: list[tuple[Array, ...]] = []
     # Ends of a recording are left out by the longest delay, so that every delay has the same data.
     for recording, motion in zip(recordings, motions, strict=True):
-        time, margin = motion.time, options.edge + options.largest_delay
-        inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
+        stamps, margin = motion.time, options.edge + options.largest_delay
+        inside = np.flatnonzero((stamps >= stamps[0] + margin) & (stamps <= stamps[-1] - margin))
         starts = np.arange(0, max(0, len(inside) - block + 1), stride)
         chosen = inside[(starts[:, None] + np.arange(block)).ravel()]
-        late = delay + drift * (time[chosen] - time[0])
-        torque = recording.torque_at(time[chosen] + late)
-        parts.append((motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], torque))
-    q, qd, qdd, tau = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    return _Data(q, qd, qdd, tau, block)
+        since = stamps[chosen] - stamps[0]
+        torque = recording.torque_at(stamps[chosen] + delay + drift * since)
+        parts.append(
+            (motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], torque, since[:, None])
+        )
+    q, qd, qdd, tau, time = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
+    return _Data(q, qd, qdd, tau, time, block)
 
 
 def _corrected_positions(
@@ -412,6 +423,59 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
                 "follows"
             )
             yield text, replace(given, tau=given.tau - ratio * part)
+
+
+def changing_friction(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> Iterator[str]:
+    """A sentence for each driven joint whose friction grows or falls during the recordings.
+
+    For the arguments see `likely_mistakes`. A wrong law, rig or delay is no change: friction may
+    follow the speed in any way, with a share of the torque, and the rig is fitted as well. The
+    scatter of the change is that of its estimates with a piece of the recordings left out.
+    """
+    data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
+    if len(data.q) < 2 * pieces * data.block:
+        return
+    rest = torch.zeros_like(data.q)
+    static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
+    piece = torch.arange(len(data.q) // data.block) * pieces * data.block // len(data.q)
+    for j in np.flatnonzero(data.tau.abs().amax(0)).tolist():
+        speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
+        knots = torch.quantile(speed, torch.linspace(0, 1, SPEED_KNOTS, dtype=speed.dtype))
+        shapes = [ones, *((speed - knot).clamp_min(0) for knot in knots[:-1]), data.tau[:, j].abs()]
+        friction = torch.stack([torch.sign(data.qd[:, j]) * shape for shape in shapes], 1)
+        rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
+        late = rate.repeat_interleave(data.block)
+        of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
+        # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
+        apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
+        sliding = apart & (data.moving()[:, j] > 0)
+        terms = [
+            data.mean(x) for x in (friction, of_rig, data.tau[:, [j]], data.time / data.time.max())
+        ]
+        if sliding.sum() < 2 * pieces or not all(bool(x.isfinite().all()) for x in terms):
+            continue
+        change = 100 * _growth(*(x[sliding] for x in terms))
+        without = [_growth(*(x[sliding & (piece != k)] for x in terms)) for k in range(pieces)]
+        sd = 100 * math.sqrt((pieces - 1) * np.var(without))
+        if abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2):
+            yield (
+                f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} by "
+                f"{abs(change):.2g} % (within {sd * student_quantile(pieces - 1, 0.975):.2g} %) "
+                "during a recording (warm-up, payload); intervals do not count that."
+            )
+
+
+def _growth(friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor) -> float:
+    """Growth of a friction in a unit of time, relative to its mean [-].
+
+    By the terms of friction and of the rig, (block, term) each, which explain the torque.
+    """
+    known = torch.cat([friction, of_rig], 1)
+    found = torch.linalg.lstsq(known, torque).solution
+    growing = (time - time.mean()) * (friction @ found[: friction.shape[1]])
+    return float(torch.linalg.lstsq(torch.cat([known, growing], 1), torque).solution[-1])
 
 
 def balanced_delay(

@@ -65,6 +65,10 @@ class FitOptions:
     # Torques are averaged over so long, short against a swing [s], and so many samples are used.
     diagnosis_block: float = 0.03
     diagnosis_samples: int = 8_000
+    # Pieces of a recording, each left out in turn to find how far friction changes with time, and
+    # the chance at which a joint's constant friction is said to change.
+    drift_pieces: int = 10
+    drift_chance: float = 1e-3
     # Rise of the energy of a free motion over its largest kinetic energy; inertias that are off by
     # their bound feign 0.43.
     energy_rise: float = 0.5

@@ -21,7 +21,12 @@ from nfriction.fitting.data.inputs import (
     require_drive,
     smoothed_motions,
 )
-from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
+from nfriction.fitting.diagnosis import (
+    balanced_delay,
+    changing_friction,
+    likely_mistakes,
+    mistake_warning,
+)
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
@@ -109,7 +114,7 @@ def prepare_task(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
     found = (
-        *mistake_warning(stated, mistakes),
+        *(mistake_warning(stated, mistakes) or changing_friction(plant, advanced, moved, options)),
         *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
     )

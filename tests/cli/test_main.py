@@ -1,6 +1,7 @@
 """The command line before it does any work: help, errors, names, and how fast they come."""
 
 import argparse
+import logging
 import os
 import re
 import subprocess
@@ -11,7 +12,7 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import demo, inputs
-from nfriction.cli.console import one_line
+from nfriction.cli.console import FirstOfItsKind, one_line
 from nfriction.friction.models import NCFM
 from nfriction.io.model_file import save
 from nfriction.papers import twin
@@ -29,6 +30,13 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
     """The words of the command with which a help ends."""
     block = parser.format_help().partition("\nexample:\n")[2].partition("\n\n")[0]
     return block.replace("\\\n", " ").split()
+
+
+def test_a_console_shows_each_kind_of_message_once() -> None:
+    new = FirstOfItsKind()
+    words = ["%d rollout(s) diverged", "%d rollout(s) diverged", "no convergence"]
+    records = [logging.makeLogRecord({"msg": msg, "args": (k,)}) for k, msg in enumerate(words)]
+    assert [new.filter(record) for record in records] == [True, False, True]
 
 
 def test_names_are_those_of_the_library() -> None:

@@ -11,6 +11,7 @@ import torch
 
 from nfriction import (
     CVFM,
+    LFM,
     NCFM,
     LinearAxis,
     Motor,
@@ -18,6 +19,7 @@ from nfriction import (
     Plant,
     Recording,
     Rotor,
+    Stribeck,
     fit,
     rollout,
 )
@@ -25,6 +27,7 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
 from tests.evaluation.test_score import zeroed_in_a_pose
+from tests.fitting.recordings import pendulum, swing
 
 COUNT = 2 * math.pi / 4096
 WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
@@ -86,6 +89,51 @@ def later(values: np.ndarray, samples: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])
 def test_sound_data_raise_no_alarm(name):
     assert warnings_of(*measured(name)) == ()
+
+
+def test_a_moment_of_a_motion_names_no_mistake():
+    """Corrections explain the few torques of a short recording by chance."""
+    plant, model = pendulum(), LFM(2, [[2e-3, 3e-3]] * 2)
+    recording = swing(plant, model, seconds=0.3)
+    assert not any("mistake" in w for w in warnings_of(plant, recording.q, None))
+
+
+@functools.cache
+def warming(change: float, chirp: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and torques of the motor with a Stribeck friction that changes linearly by this."""
+    time = STEP * np.arange(SAMPLES)
+    swept = (0.5 + 0.3 * time) * np.sin(2 * math.pi * (0.2 + 0.12 * time) * time)
+    tau = swept[:, None] if chirp else torque([3.0], 3)
+    state, parts = torch.zeros(2, 1, dtype=torch.float64), []
+    state[0] = math.pi
+    # A piece of a tenth of the recording each, with its own friction.
+    for k, part in enumerate(np.array_split(tau[:-1], 10)):
+        level = 1 + change * (k - 4.5) / 9
+        model = Stribeck(1, [[0.3 * level, 0.1 * level, 0.12 * level, 0.3, 2.0]])
+        found = rollout(
+            PendulumChain(**MOTOR), model.requires_grad_(False), *state, torch.as_tensor(part),
+            sample_time=STEP, substeps=8,
+        )  # fmt: skip
+        state = torch.stack([found.q[-1], found.qd[-1]])
+        parts.append(found.q.numpy() if k == 0 else found.q.numpy()[1:])
+    q, noise = np.concatenate(parts), np.random.default_rng(0).normal(size=tau.shape)
+    return COUNT * np.round(q / COUNT), tau + 0.01 * noise
+
+
+@pytest.mark.parametrize("change", [0.3, -0.3])
+def test_a_friction_that_changes_within_a_recording_is_named(change):
+    said = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
+    named = [re.search(r"friction of joint1 (\w+) by (\S+) % \(within (\S+) %\)", w) for w in said]
+    ((way, found, within),) = (match.groups() for match in named if match)
+    assert way == ("grows" if change > 0 else "falls")
+    assert abs(float(found) - 30) < float(within) + 1 < 20
+
+
+@pytest.mark.parametrize("chirp", [True, False])
+@pytest.mark.parametrize("mass", [1.0, 1.1])
+def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp, mass):
+    plant = PendulumChain(**MOTOR | {"mass": [mass]})
+    assert not any("friction of" in w for w in warnings_of(plant, *warming(0.0, chirp)))
 
 
 def test_a_torque_held_for_long_steps_is_no_delay():

@@ -141,6 +141,9 @@ def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
     told = {i.name: i for i in found.intervals}
     assert len(told) == 4
     assert all(i.low < i.value < i.high for i in told.values())
+    # The intervals do not hold that error.
+    assert told["F_d of joint1"].high < 0.15
+    assert any("blurs friction at low speed" in warning for warning in found.warnings)
 
 
 def test_a_regression_names_what_it_found_none_of():

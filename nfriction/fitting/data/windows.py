@@ -160,7 +160,8 @@ def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
         if count > last - first:
             raise ValueError(
                 f"{recording.name or 'a recording'} has {last - first + 1} samples in "
-                f"{duration:g} s, too few for windows of {length:g} s; use longer windows."
+                f"{duration:g} s, too few for windows of {length:g} s; check the unit of its time, "
+                "or use longer windows."
             )
         yield from pairwise(np.linspace(first, last, count + 1).astype(int).tolist())
 

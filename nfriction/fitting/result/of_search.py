@@ -95,7 +95,7 @@ def result_from_equation_error(
         residuals=torch.zeros(0, dtype=torch.float64),
         intervals=confidence_intervals(fitted_names, values, sd, lower, upper),
         unidentifiable=unidentifiable,
-        warnings=(*((*found, BLURRED) if found else ()), *outlier_warning(torque.outliers)),
+        warnings=(*found, BLURRED, *outlier_warning(torque.outliers)),
         outliers=torque.outliers,
     )
 
