@@ -128,9 +128,10 @@ class FirstOfItsKind(logging.Filter):
         self.seen: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """True for the first message of its kind, whatever its numbers."""
-        first = record.msg not in self.seen
-        self.seen.add(record.msg)
+        """True for the first message with these words, whatever its numbers."""
+        words = re.sub(r"[\d.]+(e[+-]?\d+)?", "", record.getMessage())
+        first = words not in self.seen
+        self.seen.add(words)
         return first
 
 

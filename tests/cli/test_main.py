@@ -34,9 +34,13 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
 
 def test_a_console_shows_each_kind_of_message_once() -> None:
     new = FirstOfItsKind()
-    words = ["%d rollout(s) diverged", "%d rollout(s) diverged", "no convergence"]
-    records = [logging.makeLogRecord({"msg": msg, "args": (k,)}) for k, msg in enumerate(words)]
-    assert [new.filter(record) for record in records] == [True, False, True]
+    given = [
+        ("%d rollout(s) diverged", 3), ("%d rollout(s) diverged", 4), ("%s failed: no data", "LFM"),
+        ("%s failed: no data", "NCFM"), ("%s", "first"), ("%s", "second"),
+    ]  # fmt: skip
+    records = [logging.makeLogRecord({"msg": msg, "args": (arg,)}) for msg, arg in given]
+    shown = [new.filter(record) for record in records]
+    assert shown == [True, False, True, True, True, True]
 
 
 def test_names_are_those_of_the_library() -> None:
