@@ -132,9 +132,11 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
         pairs = zip(found.plant_terms, law.plant_terms, strict=True)
         return max(abs(new - old) / open_[name] for (name, new, _), (_, old, _) in pairs)
 
-    assert 0.1 < moved() < 3.0
+    as_left = moved()
+    assert as_left < 3.0
+    # How far it moves is up to the data; that the uncertainty of the law's fit bounds it is ours.
     monkeypatch.setattr(Interval, "sd", property(lambda told: 1e-3 * open_[told.name]))
-    assert moved() < 1e-3
+    assert moved() < min(1e-3, 0.1 * as_left)
 
 
 @pytest.mark.usefixtures("sets_stay")
