@@ -6,9 +6,8 @@ from pathlib import Path
 
 import torch
 
-from nfriction import plots
 from nfriction.fuzzy import RBFNetwork
-from nfriction.papers.controller.mamdani import MamdaniController
+from nfriction.papers.controller.mamdani import MamdaniController, controller_surface
 from nfriction.papers.controller.rules import parse_rules
 from nfriction.papers.nffem.train_network import TrainingOptions, train_on_controller
 
@@ -44,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for rule in controller.rule_base.rules:
         given, then = " AND ".join(rule.given), " AND ".join(rule.then)
         print(f"IF {given} THEN B, C are {then}")
-    plots.controller_surface(controller).savefig(arguments.out / "surface.png", dpi=150)
+    controller_surface(controller).savefig(arguments.out / "surface.png", dpi=150)
 
     # Few steps and samples suffice for a look; the papers take 40,000 samples.
     network = RBFNetwork(1, 2, 10, 2)

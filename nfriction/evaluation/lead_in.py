@@ -18,7 +18,7 @@ from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.data.windows import begins_at_rest
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.autocorrelation import white_noise
-from nfriction.friction.memory import deflections, load_of
+from nfriction.friction.memory import deflections, holding_share, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
@@ -171,7 +171,13 @@ class Simulator:
                 time = torch.tensor(self.time)
                 tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
                 load = load_of(friction.law, plant, q, qd, tau)
-                self.law_states, _ = deflections(friction, time, qd, qdd, load)
+                start, still = None, torch.zeros_like(q[0])
+                if np.all(np.ptp(recording.q[: self.lead], axis=0) <= 1.5 * self.quantum):
+                    # Joints that rest are held by their friction, in balance with the torques.
+                    held = tau[0] - plant.inverse_dynamics(q[0], still, still)
+                    share, slipping = holding_share(friction, held)
+                    start = share[..., None] * slipping
+                self.law_states, _ = deflections(friction, time, qd, qdd, load, start)
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""

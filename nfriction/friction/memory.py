@@ -81,15 +81,22 @@ def states_along(
 
 
 def deflections(
-    model: FrictionModel, time: Tensor, qd: Tensor, qdd: Tensor, load: Tensor
+    model: FrictionModel,
+    time: Tensor,
+    qd: Tensor,
+    qdd: Tensor,
+    load: Tensor,
+    start: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """States of a law with memory along a motion, and its coefficients, not deflected before.
+    """States of a law with memory along a motion, and its coefficients.
 
-    `time` is (sample,), the motion (sample, joint); the results are (sample, joint, any).
+    `time` is (sample,), the motion (sample, joint), `start` the state before it, (joint, state), by
+    default not deflected; the results are (sample, joint, any).
     """
     assert model.law.memory is not None
     held = model.coefficients(qd, qdd).expand(*qd.shape, -1)
-    step, start = torch.diff(time, prepend=time[:1]), model.law.initial_state(qd[0])
+    step = torch.diff(time, prepend=time[:1])
+    start = model.law.initial_state(qd[0]) if start is None else start
     return states_along(model.law.memory, start, qd, load, held, step), held
 
 
@@ -115,6 +122,25 @@ def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
     start = ahead.new_zeros((*ahead.shape, memory.size))
     # Far, at a velocity below that of any Stribeck curve.
     return memory.advance(start, 1e-9 * ahead, ahead, coefficients, 1e15 * ahead).abs()
+
+
+def holding_share(model: FrictionModel, torque: Tensor) -> tuple[Tensor, Tensor]:
+    """Share of its largest torque with which friction holds a joint, and the state of the largest.
+
+    Args:
+        model: of a law with memory.
+        torque: to be held [N m], (*batch, joint).
+
+    Returns:
+        The share in [-1, 1], shaped like `torque`, and the state of a contact that slips slowly,
+        (joint, state).
+    """
+    assert model.law.memory is not None
+    coefficients = reference_coefficients(model)
+    still, unit = torch.zeros_like(coefficients[..., 0]), torch.ones_like(coefficients[..., 0])
+    slipping = slipping_state(model.law.memory, coefficients)
+    largest = model.law.memory.torque(slipping, still, unit, coefficients)
+    return (torque / largest.clamp(min=1e-12)).clamp(-1.0, 1.0), slipping
 
 
 def growth(x: Tensor) -> Tensor:

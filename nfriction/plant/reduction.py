@@ -144,6 +144,13 @@ def _in_series(links: Sequence[HingedLink]) -> list[HingedLink]:
     return chain
 
 
+# What to do with other robots.
+IN_SPACE = (
+    'Of a robot in space, make the joints with other axes "fixed" and record with these at rest, '
+    "or fit the torques that its inverse dynamics do not explain by `nfriction fit-torque`"
+)
+
+
 def _common_axis(links: Sequence[HingedLink], up: Array) -> Array:
     """The axis about which all links turn, made exactly horizontal."""
     first = links[0]
@@ -152,12 +159,11 @@ def _common_axis(links: Sequence[HingedLink], up: Array) -> Array:
         if lean > TILT:
             _refuse(link.name, f"has an axis {math.degrees(lean):.3g} degrees off the horizontal; "
                     "gravity must act in the plane of the links (only the first of several joints "
-                    "may turn about the vertical, as an arm). Of a robot in space, make the "
-                    "joints with other axes \"fixed\" and record with these at rest")  # fmt: skip
+                    f"may turn about the vertical, as an arm). {IN_SPACE}")  # fmt: skip
         apart = _tilt(link.axis, first.axis)
         if apart > TILT:
             _refuse(link.name, f"has an axis {math.degrees(apart):.3g} degrees off that of "
-                    f"{first.name!r}; all links must turn in one plane")  # fmt: skip
+                    f"{first.name!r}; all links must turn in one plane. {IN_SPACE}")  # fmt: skip
         # Not turned round here: the sign of its recordings would silently change.
         if link.axis @ first.axis < 0:
             _refuse(link.name, f"turns against {first.name!r}: turn its axis round, and the sign "

@@ -17,13 +17,12 @@ from nfriction.plots.neurofuzzy import (
     coefficient_sections,
     coefficient_surfaces,
     coefficients_over_time,
-    controller_surface,
     memberships,
 )
 
 __all__ = [
     "animate", "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
-    "coefficients_over_time", "controller_surface", "friction_curves",
+    "coefficients_over_time", "friction_curves",
     "horizon_curve", "mechanism", "memberships", "motion", "positions", "rmse_bars", "save_all",
     "torque_over_velocity",
 ]  # fmt: skip

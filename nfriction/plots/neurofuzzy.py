@@ -76,38 +76,6 @@ def memberships(
     return figure
 
 
-def controller_surface(controller: Any, *, points: int = 81) -> Figure:
-    """A rule-table controller's outputs over its two inputs, a map an output, inputs in SI.
-
-    Args:
-        controller: with two inputs, such as `nfriction.papers.controller.MamdaniController`:
-            `infer` gives outputs in the units of its `rule_base`, `si_factor` those of the inputs.
-        points: of the map along each axis.
-
-    Raises:
-        ValueError: if the controller has not two inputs.
-    """
-    rules = controller.rule_base
-    if len(rules.inputs) != 2:
-        raise ValueError(f"a map needs two inputs, the controller has {len(rules.inputs)}.")
-    own = [variable.universe for variable in rules.inputs]
-    grids = [np.linspace(low, high, points) for low, high in own]
-    with torch.no_grad():
-        values = controller.infer(torch.as_tensor(np.stack(np.meshgrid(*grids), -1))).numpy()
-    x, y = (grid * float(si) for grid, si in zip(grids, controller.si_factor, strict=True))
-    # The controller takes degrees to radians; a bare number stays one.
-    labels = [
-        f"{variable.name} [{variable.unit.replace('deg', 'rad').replace('^2', '²')}]"
-        for variable in rules.inputs
-    ]
-    figure, axes = style.panels(1, len(rules.outputs), style.PAGE, 2.5, sharey=True)
-    for k, (ax, output) in enumerate(zip(axes[0], rules.outputs, strict=True)):
-        draw_map(ax, (x, y), values[..., k], label=(output.name, output.unit))
-        ax.set_xlabel(labels[0])
-    axes[0, 0].set_ylabel(labels[1])
-    return figure
-
-
 def fuzzy_rules(model: FrictionModel) -> FuzzyRules:
     """The model's rules; ValueError where it has none."""
     rules = model.schedule.fuzzy_rules()

@@ -20,6 +20,7 @@ from nfriction.evaluation.lead_in import (
     lead_in_samples,
 )
 from nfriction.evaluation.score import RMSE, Score
+from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
@@ -405,3 +406,24 @@ def test_a_state_of_fewer_joints_is_refused_where_the_zero_is_estimated():
     rig, law, recording = zeroed_in_a_pose(np.zeros(2))
     with pytest.raises(ValueError, match=r"`initial_state` must be q0 and qd0 of shape \(2,\)"):
         score(rig, law, recording, initial_state=([0.0], [0.0, 0.0]), limit=False, zeroed=True)
+
+
+def test_a_joint_at_rest_is_held_by_its_bristles_from_the_start():
+    """Undeflected ones would let it sink by the displacement over which they yield."""
+    count, stiffness = 2 * np.pi / 8192, 60.0
+    plant = PendulumChain(mass=[1.0], length=[0.3], position_quantum=count)
+    friction = model_by_name("dahl")(1, (0.6, 0.05, stiffness)).requires_grad_(False)
+    time = np.arange(1000) / 500
+    tau = (1.5 * np.sin(2 * np.pi * time) * (time > 0.5))[:, None]
+    pose = torch.tensor([np.pi + 0.2], dtype=torch.float64)
+    deflection = -plant.inverse_dynamics(pose, 0 * pose, 0 * pose) / stiffness
+    run = rollout(
+        plant, friction, pose, 0 * pose, torch.tensor(tau[:-1]), sample_time=2e-3,
+        law_state=deflection[:, None],
+    )  # fmt: skip
+    held = Recording(
+        time, quantise(run.q.numpy(), 8192), tau=tau, convention="relative,upright", name="held"
+    )
+    scored = score(plant, friction, held, horizons=(1.0,), limit=False)
+    for error in (scored.free_run, scored.windows["1"]):
+        assert error.all < 0.5 * count < 0.1 * abs(float(deflection))

@@ -43,6 +43,16 @@ def test_the_table_notes_what_is_at_a_bound_or_unknown(found: FitResult) -> None
     assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
 
 
+def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitResult) -> None:
+    b = found.intervals[0].name
+    good = replace(found, noise=found.residual, converged=True)
+    for unknown, verdict in (
+        ("inertia 11 with armature 1", "good"),
+        (f"{b} with drag", "doubtful"),
+    ):
+        assert replace(good, unidentifiable=(unknown,)).usability[0] == verdict
+
+
 def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> None:
     table = replace(found, model=Stribeck(1), intervals=()).to_pandas()
     assert table.index[-1].startswith("delta of ")

@@ -83,6 +83,24 @@ def test_columns_are_mapped_with_their_units(tmp_path: Path) -> None:
         np.testing.assert_allclose(read(tmp_path, text, columns=names).q, np.deg2rad(Q), rtol=4e-16)
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_titles_above_the_header_are_passed_over(tmp_path: Path, separator: str) -> None:
+    title = f"Bench 7{2 * separator}\n\nsecond run\n"
+    assert np.array_equal(read(tmp_path, title + written(separator, False)).q, Q)
+    # A header of one word is none of a table, and numbers are no header.
+    with pytest.raises(ValueError, match=r"header|missing"):
+        read(tmp_path, written(separator, False, header="time"))
+
+
+def test_a_name_may_be_given_without_a_unit_that_is_not_known(tmp_path: Path) -> None:
+    text = written(";", False, header="time{0}enc [inc]{0}enc2 (left)")
+    columns = {"q1": "enc:counts/1000", "q2": "enc2"}
+    assert np.array_equal(read(tmp_path, text, columns=columns).q[:, 1], Q[:, 1])
+    text = written(";", False, header="time{0}enc (left){0}enc (right)")
+    with pytest.raises(ValueError, match="enc"):
+        read(tmp_path, text, columns={"q1": "enc"})
+
+
 def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
     text = written(",", False, "time{0}x{0}y")
     back = read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"})

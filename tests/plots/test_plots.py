@@ -25,7 +25,6 @@ from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.friction import model_names
 from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
-from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, Motor, Rotor, rigs
 from nfriction.plots import comparison as of_comparisons
 from nfriction.plots import style
@@ -331,19 +330,6 @@ def test_only_neuro_fuzzy_models_have_sets_and_maps():
             draw(NFLFM(2), joint_names=["one"])
     with pytest.raises(ValueError, match="before"):
         plots.memberships(NFLFM(2), NFLFM(2, terms=(3, 5)))
-
-
-def test_controller_map_is_the_controller_in_si():
-    controller = paper_controller(2)
-    figure = plots.controller_surface(controller, points=9)
-    maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
-    assert maps[0].get_xlabel() == "velocity [rad/s]"
-    for k, ax in enumerate(maps):
-        mesh = ax.collections[0]
-        qd, qdd = (torch.as_tensor(x) for x in np.moveaxis(mesh.get_coordinates(), -1, 0))
-        expected = 1e3 * controller(qd, qdd)[..., k].numpy()
-        np.testing.assert_allclose(mesh.get_array(), expected, rtol=1e-9)
-    assert_tidy(figure)
 
 
 @given(st.floats(1e-6, 1e6), st.sampled_from(["rad", "m", "N m s/rad"]))

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.friction.memory import reference_coefficients, slipping_state
+from nfriction.friction.memory import holding_share
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -69,14 +69,9 @@ class Windows:
         The motion before would show them only where it is known to a fraction of the displacement
         over which contacts yield.
         """
-        assert model.law.memory is not None
-        coefficients = reference_coefficients(model)
-        still, unit = torch.zeros_like(self.q0[0]), torch.ones_like(self.q0[0])
-        slipping = slipping_state(model.law.memory, coefficients)
-        largest = model.law.memory.torque(slipping, still, unit, coefficients)
         qdd = [torch.as_tensor(self.motions[place].qdd)[first] for place, first, _ in self.spans]
         found = self.tau[:, 0] - plant.inverse_dynamics(self.q0, self.qd0, torch.stack(qdd))
-        share = (found / largest.clamp(min=1e-12)).clamp(-1.0, 1.0)
+        share, slipping = holding_share(model, found)
         return replace(self, law_state=share[..., None].expand(-1, -1, slipping.shape[-1]))
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:

@@ -171,8 +171,10 @@ class FitResult:
             reasons.append("the search did not converge")
         if wrong:
             reasons.append(far)
-        if self.unidentifiable:
-            count = len(self.unidentifiable)
+        # Of terms of the rig, as of link and rotor, their combination is all that a motion takes.
+        names = set(self.model.schedule.parameter_names(self.plant.joint_names))
+        count = sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable)
+        if count:
             reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 

@@ -24,6 +24,8 @@ from nfriction.io.formats.selection import is_unit
 ATTRIBUTES = ("convention", "unit", "names")
 
 _SEPARATORS = ("\t", ";", ",")
+# Lines within which a table begins, below its titles.
+MOST_TITLES = 20
 _NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
 
 
@@ -55,6 +57,7 @@ def parse_csv(text: str) -> pd.DataFrame:
     content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
     if not content:
         raise ValueError("it has no header")
+    content = _without_title(content)
     lines = content[:3]
     separator = _separator(lines[0].rstrip("\r\n"), lines[1:])
     header = next(csv.reader([lines[0]], delimiter=separator, skipinitialspace=True))
@@ -84,10 +87,14 @@ def parse_csv(text: str) -> pd.DataFrame:
     for column in table.columns:
         # "time [s]" may also be called "time".
         named = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]*\]|\([^()]*\))", column)
-        if named and is_unit(named[2]):
+        if not named:
+            continue
+        if is_unit(named[2]):
             units.setdefault(column, named[2])
-            if named[1] not in table.columns:
-                aliases.setdefault(named[1], column)
+        # "position (left)" and "position (right)" have no common short name.
+        alike = [c for c in table.columns if c.startswith((f"{named[1]} ", f"{named[1]}["))]
+        if named[1] not in table.columns and (is_unit(named[2]) or alike == [column]):
+            aliases.setdefault(named[1], column)
     repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
     settings = _comments(text)
     # Who separates cells by commas hardly writes them in numbers, too.
@@ -125,6 +132,17 @@ def _comments(text: str) -> dict[str, str]:
 
 def _is_comment(line: str) -> bool:
     return line.lstrip().startswith("#")
+
+
+def _without_title(lines: list[str]) -> list[str]:
+    """The lines from the header on: titles before it fill one cell of its row."""
+    row = lines[min(len(lines), MOST_TITLES) - 1]
+    separator = next((s for s in _SEPARATORS if s in row), None)
+    cells = [[c for c in line.split(separator) if c.strip()] for line in lines[:MOST_TITLES]]
+    header = next((k for k, filled in enumerate(cells) if len(filled) > 1), 0)
+    # Below a header of one word come numbers.
+    numbers = any(is_number(cell.replace(",", ".")) for cell in cells[header])
+    return lines if numbers else lines[header:]
 
 
 def _separator(header: str, rows: list[str]) -> str:

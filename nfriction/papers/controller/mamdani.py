@@ -1,12 +1,18 @@
 """The papers' fuzzy controller: rule table, min and max, centroid; differentiable and batched."""
 
 from importlib import resources
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, parse_rules
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_CELLS = 81  # of a map along each axis
 _SAMPLES_AT_ONCE = 512  # the clipped output sets of this many fit a core's cache
 
 
@@ -174,3 +180,32 @@ def _output_sets(
         offset = universe - 0.5 * (universe[0] + universe[-1])
         moments[o] = torch.stack([weights, weights * offset])
     return shapes, moments
+
+
+def controller_surface(controller: MamdaniController) -> "Figure":
+    """A controller's outputs over its two inputs in SI, a map an output.
+
+    Raises:
+        ValueError: if the controller has not two inputs.
+    """
+    from nfriction.plots import style  # matplotlib is slow to import
+    from nfriction.plots.neurofuzzy import draw_map
+
+    rules = controller.rule_base
+    if len(rules.inputs) != 2:
+        raise ValueError(f"a map needs two inputs, the controller has {len(rules.inputs)}.")
+    grids = [np.linspace(*variable.universe, _CELLS) for variable in rules.inputs]
+    with torch.no_grad():
+        values = controller.infer(torch.as_tensor(np.stack(np.meshgrid(*grids), -1))).numpy()
+    x, y = (grid * float(si) for grid, si in zip(grids, controller.si_factor, strict=True))
+    # The controller takes degrees to radians; a bare number stays one.
+    labels = [
+        f"{variable.name} [{variable.unit.replace('deg', 'rad').replace('^2', '²')}]"
+        for variable in rules.inputs
+    ]
+    figure, axes = style.panels(1, len(rules.outputs), style.PAGE, 2.5, sharey=True)
+    for k, (ax, output) in enumerate(zip(axes[0], rules.outputs, strict=True)):
+        draw_map(ax, (x, y), values[..., k], label=(output.name, output.unit))
+        ax.set_xlabel(labels[0])
+    axes[0, 0].set_ylabel(labels[1])
+    return figure

@@ -67,17 +67,18 @@ def fit_rbf(task: FitTask) -> FitResult:
     prior = constant_prior(start.model, regression(task, start.model, task.plant), options)
     law = replace(fitter, friction=start.model, friction_prior=prior)
     length = start.longest_usable_horizon(options.windows)
-    end, note = None, INTERRUPTED
+    end = None
     try:
         validation = Validation(law, start, motions, length)
         trial = validation.judged(validation.trial(fitter, base, "network, hold-out"))
         note = verdict(trial.squares, validation.of_law)
         if gains(trial.squares, validation.of_law):
             end = validation.fit_all(trial)
+            note = validation.lost_by(end)
     except StoppedError:
-        pass
+        note = INTERRUPTED
     schedule.set_sample_time(sample_time)
-    if end is None:
+    if end is None or note:
         return constant_kept(start, model, note, converged=note != INTERRUPTED)
     found = result_from_shooting(model, end.problem, end.result, task.motions)
     found = replace(

@@ -17,12 +17,12 @@ from tqdm import tqdm
 
 from nfriction.io.files import atomic_write, write_atomically
 from nfriction.papers.control.study import SAMPLE_TIME, SHARED, THINNED, balance_figure
-from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.papers.controller.mamdani import controller_surface, paper_controller
 from nfriction.papers.reproduction import figures, tables
 from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER, stages
 from nfriction.papers.reproduction.workspace import Workspace
 from nfriction.plant import rigs
-from nfriction.plots import animate, controller_surface, rmse_bars
+from nfriction.plots import animate, rmse_bars
 from nfriction.version import __version__
 
 PAGE = "reproduction.html"

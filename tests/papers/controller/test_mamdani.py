@@ -11,7 +11,11 @@ from hypothesis import strategies as st
 
 from nfriction.fuzzy import FuzzySet
 from nfriction.papers.controller.fis import parse_fis
-from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
+from nfriction.papers.controller.mamdani import (
+    MamdaniController,
+    controller_surface,
+    paper_controller,
+)
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 
 FLOAT64 = torch.float64
@@ -220,3 +224,15 @@ def test_unsound_options_are_refused() -> None:
         MamdaniController(rules, centroid="mean")
     with pytest.raises(ValueError, match="points"):
         MamdaniController(rules, points=1)
+
+
+def test_controller_map_is_the_controller_in_si():
+    controller = paper_controller(2)
+    figure = controller_surface(controller)
+    maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    assert maps[0].get_xlabel() == "velocity [rad/s]"
+    for k, ax in enumerate(maps):
+        mesh = ax.collections[0]
+        qd, qdd = (torch.as_tensor(x) for x in np.moveaxis(mesh.get_coordinates(), -1, 0))
+        expected = 1e3 * controller(qd, qdd)[..., k].numpy()
+        np.testing.assert_allclose(mesh.get_array(), expected, rtol=1e-9)
