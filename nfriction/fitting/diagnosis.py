@@ -437,7 +437,7 @@ def changing_friction(
     scatter of the change is that of its estimates with a piece of the sliding left out.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
-    if not len(data.q):
+    if len(data.q) < 2 * pieces * data.block:
         return
     rest = torch.zeros_like(data.q)
     static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
@@ -452,9 +452,7 @@ def changing_friction(
         # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
         apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
         sliding = apart & (data.moving()[:, j] > 0)
-        # Each piece has as many blocks as there are terms: fewer leave the change to chance.
-        terms_sought = friction.shape[1] + of_rig.shape[1] + 1
-        if (count := int(sliding.sum())) < pieces * terms_sought:
+        if (count := int(sliding.sum())) < 2 * pieces:
             continue
         terms = [data.mean(x)[sliding] for x in (friction, of_rig, data.tau[:, [j]], data.time)]
         if not all(bool(x.isfinite().all()) for x in terms):

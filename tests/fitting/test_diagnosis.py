@@ -40,7 +40,7 @@ MOTOR = {"mass": [1.0], "length": [0.3], "com": [0.15], "inertia": [0.0075], "ar
 
 def torque(peaks: list[float], seed: int) -> np.ndarray:
     """Sums of sines with these peaks, (sample, joint)."""
-    rng = np.random.default_rng(216)
+    rng = np.random.default_rng(seed)
     time = STEP * np.arange(SAMPLES)
     columns = []
     for peak in peaks:
@@ -137,13 +137,12 @@ def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp,
 
 
 def test_rest_after_a_push_is_no_evidence_of_a_change_of_friction():
-    law = Stribeck(1, [[0.3, 0.3, 0.12, 0.5, 2.0]])
     time = STEP * np.arange(2500)
     tau = np.where(time < 0.7, 2.5 * np.sin(2 * math.pi * time), 0.0)[:, None]
-    plant = PendulumChain(**MOTOR)
+    model, plant = Stribeck(1, [[0.3, 0.3, 0.12, 0.5, 2.0]]), PendulumChain(**MOTOR)
     rest = torch.zeros(1, dtype=torch.float64)
     found = rollout(
-        plant, law.requires_grad_(False), rest + math.pi, rest, torch.as_tensor(tau[:-1]),
+        plant, model.requires_grad_(False), rest + math.pi, rest, torch.as_tensor(tau[:-1]),
         sample_time=STEP, substeps=4,
     )  # fmt: skip
     tau = tau + 0.01 * np.random.default_rng(216).normal(size=tau.shape)
