@@ -214,8 +214,10 @@ def _collect(
     """
     # Both sides of the balance are averaged alike, which takes the noise of accelerations out.
     block = max(1, round(options.diagnosis_block / recordings[0].sample_time))
-    # Blocks are left out evenly where there are more samples than needed.
-    stride = block * math.ceil(sum(map(len, recordings)) / options.diagnosis_samples)
+    # Blocks are left out evenly where there are more samples than needed; at a high rate a block
+    # has many.
+    most = max(options.diagnosis_samples, 10 * FEWEST_BLOCKS * block)
+    stride = block * math.ceil(sum(map(len, recordings)) / most)
     parts: list[tuple[Array, ...]] = []
     # Ends of a recording are left out by the longest delay, so that every delay has the same data.
     for recording, motion in zip(recordings, motions, strict=True):
@@ -432,14 +434,13 @@ def changing_friction(
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay is no change: friction may
     follow the speed in any way, with a share of the torque, and the rig is fitted as well. The
-    scatter of the change is that of its estimates with a piece of the recordings left out.
+    scatter of the change is that of its estimates with a piece of the sliding left out.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
     rest = torch.zeros_like(data.q)
     static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
-    piece = torch.arange(len(data.q) // data.block) * pieces * data.block // len(data.q)
     for j in np.flatnonzero(data.tau.abs().amax(0)).tolist():
         speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
         knots = torch.quantile(speed, torch.linspace(0, 1, SPEED_KNOTS, dtype=speed.dtype))
@@ -451,13 +452,16 @@ def changing_friction(
         # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
         apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
         sliding = apart & (data.moving()[:, j] > 0)
-        terms = [
-            data.mean(x) for x in (friction, of_rig, data.tau[:, [j]], data.time / data.time.max())
-        ]
-        if sliding.sum() < 2 * pieces or not all(bool(x.isfinite().all()) for x in terms):
+        if (count := int(sliding.sum())) < 2 * pieces:
             continue
-        change = 100 * _growth(*(x[sliding] for x in terms))
-        without = [_growth(*(x[sliding & (piece != k)] for x in terms)) for k in range(pieces)]
+        terms = [data.mean(x)[sliding] for x in (friction, of_rig, data.tau[:, [j]], data.time)]
+        if not all(bool(x.isfinite().all()) for x in terms):
+            continue
+        # Per time of sliding, in pieces that all have some: rest says nothing.
+        terms[-1] = terms[-1] / (terms[-1].max() - terms[-1].min())
+        piece = torch.arange(count) * pieces // count
+        change = 100 * _growth(*terms)
+        without = [_growth(*(x[piece != k] for x in terms)) for k in range(pieces)]
         sd = 100 * math.sqrt((pieces - 1) * np.var(without))
         if abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2):
             yield (

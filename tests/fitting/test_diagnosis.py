@@ -136,6 +136,28 @@ def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp,
     assert not any("friction of" in w for w in warnings_of(plant, *warming(0.0, chirp)))
 
 
+def test_rest_after_a_push_is_no_evidence_of_a_change_of_friction():
+    time = STEP * np.arange(2500)
+    tau = np.where(time < 0.7, 2.5 * np.sin(2 * math.pi * time), 0.0)[:, None]
+    model, plant = Stribeck(1, [[0.3, 0.3, 0.12, 0.5, 2.0]]), PendulumChain(**MOTOR)
+    rest = torch.zeros(1, dtype=torch.float64)
+    found = rollout(
+        plant, model.requires_grad_(False), rest + math.pi, rest, torch.as_tensor(tau[:-1]),
+        sample_time=STEP, substeps=4,
+    )  # fmt: skip
+    tau = tau + 0.01 * np.random.default_rng(216).normal(size=tau.shape)
+    said = warnings_of(plant, COUNT * np.round(found.q.numpy() / COUNT), tau)
+    assert not any("friction of" in w for w in said)
+
+
+def test_a_mistake_is_named_at_a_high_rate_too():
+    """Few blocks remained of many samples each."""
+    plant, q, tau = measured("motor", None)
+    slow, time = STEP * np.arange(SAMPLES), 5e-5 * np.arange(120_000)
+    q, tau = (np.interp(time, slow, x[:, 0])[:, None] for x in (q, tau))
+    assert any("sign" in w for w in warnings_of(plant, q, -tau, time=time))
+
+
 def test_a_torque_held_for_long_steps_is_no_delay():
     plant, step = PendulumChain(**DOUBLE | {"inertia": [0.005, 0.002]}), 4e-3
     rng = np.random.default_rng(0)
