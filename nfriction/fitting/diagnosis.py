@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.fitting.result.paired_test import student_quantile
+from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
@@ -434,7 +434,8 @@ def changing_friction(
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay is no change: friction may
     follow the speed in any way, with a share of the torque, and the rig is fitted as well. The
-    scatter of the change is that of its estimates with a piece of the sliding left out.
+    scatter of the change is that of its estimates with a piece of the sliding left out, whose
+    torque it has to explain, too: in one short motion a speed that falls looks like a time.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
@@ -460,10 +461,12 @@ def changing_friction(
         # Per time of sliding, in pieces that all have some: rest says nothing.
         terms[-1] = terms[-1] / (terms[-1].max() - terms[-1].min())
         piece = torch.arange(count) * pieces // count
-        change = 100 * _growth(*terms)
-        without = [_growth(*(x[piece != k] for x in terms)) for k in range(pieces)]
-        sd = 100 * math.sqrt((pieces - 1) * np.var(without))
-        if abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2):
+        change = 100 * _growth(piece < 0, *terms)[0]
+        found = [_growth(piece == k, *terms) for k in range(pieces)]
+        sd = 100 * math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
+        constant, growing = torch.stack([squares for _, squares in found]).T
+        known = abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
+        if known and gains(growing, constant, options.drift_chance):
             yield (
                 f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} by "
                 f"{abs(change):.2g} % (within {sd * student_quantile(pieces - 1, 0.975):.2g} %) "
@@ -471,15 +474,22 @@ def changing_friction(
             )
 
 
-def _growth(friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor) -> float:
+def _growth(
+    left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
+) -> tuple[float, Tensor]:
     """Growth of a friction in a unit of time, relative to its mean [-].
 
-    By the terms of friction and of the rig, (block, term) each, which explain the torque.
+    By the terms of friction and of the rig, (block, term) each, which explain the torque. With it,
+    sums of squares of the torque that a constant and a growing friction miss on blocks left out.
     """
     known = torch.cat([friction, of_rig], 1)
-    found = torch.linalg.lstsq(known, torque).solution
-    growing = (time - time.mean()) * (friction @ found[: friction.shape[1]])
-    return float(torch.linalg.lstsq(torch.cat([known, growing], 1), torque).solution[-1])
+    seen = ~left_out
+    constant = torch.linalg.lstsq(known[seen], torque[seen]).solution
+    growing = (time - time[seen].mean()) * (friction @ constant[: friction.shape[1]])
+    terms = torch.cat([known, growing], 1)
+    found = torch.linalg.lstsq(terms[seen], torque[seen]).solution
+    missed = [torque - known @ constant, torque - terms @ found]
+    return float(found[-1]), torch.stack([x[left_out].square().sum() for x in missed])
 
 
 def balanced_delay(

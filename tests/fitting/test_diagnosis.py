@@ -136,17 +136,35 @@ def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp,
     assert not any("friction of" in w for w in warnings_of(plant, *warming(0.0, chirp)))
 
 
-def test_rest_after_a_push_is_no_evidence_of_a_change_of_friction():
+@pytest.mark.parametrize(
+    ("pushed", "coefficients", "mass", "seed"),
+    [
+        (
+            lambda t: np.where(t < 0.7, 2.5 * np.sin(2 * math.pi * t), 0.0),
+            [0.3, 0.3, 0.12, 0.5],
+            1.0,
+            216,
+        ),
+        (
+            lambda t: 3 * np.exp(-3 * t / t[-1]) * np.sin(2 * np.pi * 1.1 * t),
+            [0.35, 0.0, 0.12, 1.0],
+            1.15,
+            18,
+        ),
+    ],
+    ids=["rest after a push", "a motion that decays, with a wrong mass"],
+)
+def test_one_short_motion_is_no_evidence_of_a_change_of_friction(pushed, coefficients, mass, seed):
     time = STEP * np.arange(2500)
-    tau = np.where(time < 0.7, 2.5 * np.sin(2 * math.pi * time), 0.0)[:, None]
-    model, plant = Stribeck(1, [[0.3, 0.3, 0.12, 0.5, 2.0]]), PendulumChain(**MOTOR)
+    tau, law = pushed(time)[:, None], Stribeck(1, [[*coefficients, 2.0]])
     rest = torch.zeros(1, dtype=torch.float64)
     found = rollout(
-        plant, model.requires_grad_(False), rest + math.pi, rest, torch.as_tensor(tau[:-1]),
-        sample_time=STEP, substeps=4,
+        PendulumChain(**MOTOR), law.requires_grad_(False), rest + math.pi, rest,
+        torch.as_tensor(tau[:-1]), sample_time=STEP, substeps=4,
     )  # fmt: skip
-    tau = tau + 0.01 * np.random.default_rng(216).normal(size=tau.shape)
-    said = warnings_of(plant, COUNT * np.round(found.q.numpy() / COUNT), tau)
+    tau = tau + 0.01 * np.random.default_rng(seed).normal(size=tau.shape)
+    given = PendulumChain(**MOTOR | {"mass": [mass]})
+    said = warnings_of(given, COUNT * np.round(found.q.numpy() / COUNT), tau)
     assert not any("friction of" in w for w in said)
 
 
