@@ -371,7 +371,7 @@ def estimate_zero(
         data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
         prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
-        # By noise alone: what the model's own error makes of the zero is the model's fault.
+        # By noise alone: errors of the zero that the model causes are its own.
         noise = white_noise(torch.tensor(now)[None]).numpy().clip(DEFAULTS.min_noise)
         known = np.einsum("akj,bkj->ab", slopes / noise, slopes / noise)
         root = np.linalg.cholesky(np.linalg.inv(known + prior))

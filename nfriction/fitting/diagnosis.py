@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 # Samples of a block that show a curvature despite their noise.
 FEWEST_FOR_CURVATURE = 5
-# Of fewer blocks, one of the corrections explains most by chance.
+# With fewer blocks, one of the corrections would explain most of the torque by chance.
 FEWEST_BLOCKS = 20
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
@@ -111,7 +111,7 @@ def likely_mistakes(
         if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
             sound = min(delay[1], sound)
     tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
-    # Of unlike zeros recordings of one rig balance differently.
+    # With different zeros, recordings of one rig balance differently.
     if len(recordings) > 1 and not zeroed:
         tested.append(_odd_one_out(plant, recordings, motions, options))
     found = [
@@ -434,8 +434,8 @@ def changing_friction(
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay is no change: friction may
     follow the speed in any way, with a share of the torque, and the rig is fitted as well. The
-    scatter of the change is that of its estimates with a piece of the sliding left out, whose
-    torque it has to explain, too: in one short motion a speed that falls looks like a time.
+    change has to exceed the scatter of its estimates with each piece of the sliding left out, and
+    to explain the torque of these pieces: in a short motion, time and a falling speed look alike.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
@@ -482,8 +482,7 @@ def _growth(
     By the terms of friction and of the rig, (block, term) each, which explain the torque. With it,
     sums of squares of the torque that a constant and a growing friction miss on blocks left out.
     """
-    known = torch.cat([friction, of_rig], 1)
-    seen = ~left_out
+    known, seen = torch.cat([friction, of_rig], 1), ~left_out
     constant = torch.linalg.lstsq(known[seen], torque[seen]).solution
     growing = (time - time[seen].mean()) * (friction @ constant[: friction.shape[1]])
     terms = torch.cat([known, growing], 1)

@@ -171,7 +171,7 @@ class FitResult:
             reasons.append("the search did not converge")
         if wrong:
             reasons.append(far)
-        # Of terms of the rig, as of link and rotor, their combination is all that a motion takes.
+        # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.
         names = set(self.model.schedule.parameter_names(self.plant.joint_names))
         count = sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable)
         if count:

@@ -116,7 +116,8 @@ def fit_constant(task: FitTask) -> FitResult:
         skipped_horizons=search.skipped,
     )
     skipped = f"Windows of {' and '.join(f'{length:g}' for length in search.skipped)} s"
-    said = [f"{skipped} were skipped: {why}." for r, why in SKIPPED.items() if r == search.reason]
+    why = SKIPPED.get(search.reason)
+    said = [f"{skipped} were skipped: {why}."] if why else []
     if search.reason == "noisy":
         noisy = f"{skipped} were not needed: over them noise of the torque adds up"
         fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")

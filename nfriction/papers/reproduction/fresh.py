@@ -1,7 +1,7 @@
 """Fresh releases of the TLRIP twin, by which models are put in order.
 
 Two releases leave the order to chance, as one of them is from upright, where the motion amplifies
-whatever is off. Here are ten that can be predicted.
+every error. These ten can be predicted.
 """
 
 import numpy as np
