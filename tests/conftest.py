@@ -9,10 +9,21 @@ import pytest
 import torch
 from hypothesis import settings
 
+from nfriction.codegen import jit
+
 # Several threads make small tensors up to 100 times slower on a busy machine.
 torch.set_num_threads(1)
 settings.register_profile("default", deadline=None, max_examples=50, derandomize=True)
 settings.load_profile("default")
+
+
+@pytest.fixture(autouse=True)
+def compiler_effort(request: pytest.FixtureRequest) -> None:
+    """Compile kernels in a third of the time, to a third of the speed, but in the compiler's tests.
+
+    Elsewhere most tests call a kernel a few times only. Processes they start do as users' do.
+    """
+    jit.EFFORT = 1 if request.path.parent.name == "codegen" else 0
 
 
 @pytest.fixture(scope="session")

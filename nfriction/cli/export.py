@@ -63,7 +63,7 @@ def add_verify(commands: Commands) -> None:
         "verify", run_verify, "prove that an artefact is its model",
         description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
         "over its test vectors and over many points beside the model. Exit status 1 if they "
-        "differ. C is compiled and run as it is: verify it from hands that you trust.",
+        "differ. C is compiled and run as it is: verify only files that you trust.",
         example="nfriction verify artefacts/model.pt model.json",
     )  # fmt: skip
     parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")

@@ -271,21 +271,15 @@ def onnx(
     takes its place, by ONNX Runtime where that is installed, else by ONNX's own evaluator.
 
     Args:
-        model: a friction model.
-        path: file to write, by custom `.onnx`; missing folders are made.
-        info: description of the model besides its parameters.
         dtype: "float64" or "float32", of inputs, outputs and all between.
-        torque_limit, with_filter, cutoff_hz: see `controller_of`.
+        others: as of `torchscript`; the file is by custom `.onnx`.
 
     Returns:
         The path.
 
     Raises:
         ImportError: if the package `onnx` is missing.
-        ExportError: if an operation of the model has no ONNX form here, or the artefact differs
-            from the model.
-        ValueError: if `info` or an option is malformed.
-        OSError: if the file cannot be written.
+        ExportError, ValueError, OSError: as `torchscript`.
     """
     _package()
     if dtype == "float32" and with_filter:

@@ -183,37 +183,37 @@ def _bristles(model: FrictionModel, info: ModelInfo) -> DampingFit | None:
     )  # fmt: skip
 
 
-def _motors(found: DampingFit) -> list[dict[str, str]]:
-    """Attributes of MuJoCo's motors, one a joint, that do nothing but rub."""
-    return [
-        {"joint": name, "input": "none", "motorconst": "0", "resistance": "1",
-         "lugre": " ".join(f"{x:.15g}" for x in own)}
-        for name, own in zip(found.joint_names, found.lugre, strict=False)
-    ]  # fmt: skip
-
-
 def _written(
     found: DampingFit, path: str | Path, root: str, patch: str | Path | None
 ) -> DampingFit:
     """Write the numbers as a file of their own, or into a robot of that root element."""
-    numbers = found.joint_names, found.damping, found.frictionloss
-    motors = _motors(found)
     if patch is not None:
-        write_atomically(path, patched(patch, root, *numbers, motors))
+        write_atomically(path, patched(patch, root, found))
         return found
     # An XML comment must not hold two hyphens.
     note = "\n".join(f"       {x}" for x in str(found).replace("--", "- -").splitlines())
     whole, row = _SNIPPETS[root]
     rows = "\n".join(
         row.format(name=quoteattr(name), damping=d, friction=f)
-        for name, d, f in zip(*numbers, strict=True)
+        for name, d, f in zip(found.joint_names, found.damping, found.frictionloss, strict=True)
     )
-    actuators = ElementTree.Element("actuator")
-    for motor in motors:
-        ElementTree.SubElement(actuators, "dcmotor", motor)
-    text = f"{ElementTree.tostring(actuators, encoding='unicode')}\n" if motors else ""
+    motors = ElementTree.Element(root)
+    _add_motors(motors, found)
+    text = "".join(f"{ElementTree.tostring(x, encoding='unicode')}\n" for x in motors)
     write_atomically(path, whole.format(note=note, rows=rows, motors=text).encode())
     return found
+
+
+def _add_motors(tree: ElementTree.Element, found: DampingFit) -> None:
+    """Add MuJoCo's motors, one a joint with LuGre friction, that do nothing but rub."""
+    if not found.lugre:
+        return
+    actuators = tree.find("actuator")
+    actuators = ElementTree.SubElement(tree, "actuator") if actuators is None else actuators
+    for name, own in zip(found.joint_names, found.lugre, strict=True):
+        friction = " ".join(f"{x:.15g}" for x in own)
+        motor = {"joint": name, "input": "none", "motorconst": "0", "resistance": "1"}
+        ElementTree.SubElement(actuators, "dcmotor", motor, lugre=friction)
 
 
 # Files by their root element, and what they say of a joint. An MJCF has a default class for each
@@ -270,14 +270,7 @@ def _fit(columns: np.ndarray, tau: np.ndarray, joint: int) -> tuple[float, float
     return damping, frictionloss
 
 
-def patched(
-    path: str | Path,
-    root: str,
-    names: Sequence[str],
-    damping: Sequence[float],
-    frictionloss: Sequence[float],
-    motors: Sequence[dict[str, str]] = (),
-) -> bytes:
+def patched(path: str | Path, root: str, found: DampingFit) -> bytes:
     """A robot description with that root element, and the friction of the named joints replaced."""
     try:
         tree = parse_xml(Path(path), comments=True)
@@ -288,7 +281,7 @@ def patched(
     # In MJCF other things refer to joints by elements of that name too.
     bodies = tree.findall("worldbody") if root == "mujoco" else [tree]
     joints = [joint for body in bodies for joint in body.iter("joint")]
-    for name, d, f in zip(names, damping, frictionloss, strict=True):
+    for name, d, f in zip(found.joint_names, found.damping, found.frictionloss, strict=True):
         matches = [joint for joint in joints if joint.get("name") == name]
         if len(matches) != 1:
             known = ", ".join(str(joint.get("name")) for joint in joints)[:200]
@@ -304,12 +297,8 @@ def patched(
         target.set("frictionloss" if root == "mujoco" else "friction", repr(f))
     for group in tree.findall("actuator"):
         for old in group.findall("dcmotor[@lugre][@input='none']"):
-            if old.get("joint") in names:
+            if old.get("joint") in found.joint_names:
                 group.remove(old)
-    if motors:
-        actuators = tree.find("actuator")
-        actuators = ElementTree.SubElement(tree, "actuator") if actuators is None else actuators
-        for motor in motors:
-            ElementTree.SubElement(actuators, "dcmotor", motor)
+    _add_motors(tree, found)
     text = ElementTree.tostring(tree, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'.encode()

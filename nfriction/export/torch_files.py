@@ -223,19 +223,7 @@ def pt2(
     metadata (see `Contract`) are JSON under `nfriction.json` in `extra_files`. The file is loaded
     again and compared with the model before it takes its place.
 
-    Args:
-        model: a friction model.
-        path: file to write, by custom `.pt2`; missing folders are made.
-        info: description of the model besides its parameters.
-        torque_limit, with_filter, cutoff_hz: see `controller_of`.
-
-    Returns:
-        The path.
-
-    Raises:
-        ExportError: if torch cannot export the model, or the artefact differs from it.
-        ValueError: if `info` or an option is malformed.
-        OSError: if the file cannot be written.
+    Args, Returns, Raises: as `torchscript`; the file is by custom `.pt2`.
     """
     controller = controller_of(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz

@@ -207,6 +207,13 @@ class FuzzyRules:
     coefficients: Tensor
     along_motion: bool
 
+    @property
+    def constant(self) -> bool:
+        """True if all rules of a joint have the same coefficients, as of a rejected network."""
+        first = self.coefficients[:, :1].expand_as(self.coefficients)
+        # A network's sums round.
+        return torch.allclose(self.coefficients, first, rtol=1e-9, atol=0.0)
+
     def memberships(self, variable: int, joint: int, x: Tensor) -> Tensor:
         """Memberships (point, set) of values (point,) of an input, clamped to its range."""
         held = x.clamp(self.lower[joint, variable], self.upper[joint, variable])[:, None]

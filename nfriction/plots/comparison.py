@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -441,8 +440,4 @@ def _figures(
 def _follows_motion(model: FrictionModel) -> bool:
     """True unless the coefficients are constants, as also those of a rejected network."""
     rules = model.schedule.fuzzy_rules()
-    if rules is None:
-        return model.schedule.follows_motion
-    first = rules.coefficients[:, :1].expand_as(rules.coefficients)
-    # A network's sums round.
-    return not torch.allclose(rules.coefficients, first, rtol=1e-9, atol=0.0)
+    return model.schedule.follows_motion if rules is None else not rules.constant

@@ -366,13 +366,11 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
         if fuzzy is None:
             continue
         heads = [f"{coefficient} = [{u}]" for coefficient, u in _units(run, name).items()]
-        joints = []
-        in_words = rules_in_words(model, run.comparison.joint_names)
-        first = [[of.rules[0].values] * len(of.rules) for of in in_words]
-        # All rules of a rejected network say the same, but for rounding.
-        if np.allclose([[rule.values for rule in of.rules] for of in in_words], first, 1e-9, 0.0):
+        if fuzzy.constant:
             yield {"name": name, "constant": True}
             continue
+        joints = []
+        in_words = rules_in_words(model, run.comparison.joint_names)
         fired = run.fits[name].rule_seconds
         for j, of in enumerate(in_words):
             seconds = fired[j] if len(fired) == len(in_words) else ()

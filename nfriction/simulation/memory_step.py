@@ -70,11 +70,7 @@ def memory_step(
     """One step with coefficients, torque and friction held.
 
     Args:
-        plant, friction: the mechanism and its friction model, whose law has memory.
-        q, qd: state at the start of the step, (*batch, joint).
-        tau: torque over the step, (*batch, joint).
-        coefficients: held over the step, (*batch, joint, coefficient).
-        step: step length [s], a number or (*batch, 1).
+        plant, ..., step: as of `rk4_step`; the friction's law has memory.
         state: of the law at the start, (*batch, joint, state).
 
     Returns:

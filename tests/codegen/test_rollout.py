@@ -66,6 +66,7 @@ def assert_same(got, expected):
         torch.testing.assert_close(ours, theirs.transpose(0, 1), **TOLERANCE)
 
 
+@pytest.mark.slow
 def test_constant_coefficients_agree_after_1000_steps(coulomb):
     plant, friction, compiled = coulomb
     q, qd = start(batch=3)
@@ -74,6 +75,7 @@ def test_constant_coefficients_agree_after_1000_steps(coulomb):
     assert got.diverged_at.tolist() == [-1, -1, -1]
 
 
+@pytest.mark.slow
 def test_held_coefficients_agree_after_1000_steps(neurofuzzy):
     plant, friction, compiled = neurofuzzy
     q, qd = start()

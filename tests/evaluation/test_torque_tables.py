@@ -81,6 +81,7 @@ def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
     assert wide / 120 < 0.6
 
 
+@pytest.mark.slow
 def test_a_network_is_kept_where_friction_follows_the_acceleration_and_only_there() -> None:
     time, qd = motion(1200, 3)
     qdd = np.gradient(qd, time)

@@ -34,8 +34,8 @@ def test_every_example_is_known() -> None:
     assert {path.stem for path in EXAMPLES} == set(SAID)
 
 
-# A cluster's processes load the whole package first.
-SLOW = {"many_fits_on_dask"}
+# A cluster's processes load the whole package first; networks train for seconds.
+SLOW = {"many_fits_on_dask", "neuro_fuzzy"}
 RUNS = [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW))
         for path in EXAMPLES]  # fmt: skip
 

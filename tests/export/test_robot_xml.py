@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from nfriction.export.simulators import patched
+from nfriction.export.simulators import DampingFit, patched
 
 URDF = """<robot name="r"><link name="l"/>
   <joint name="a" type="revolute"><limit effort="1"/></joint>
@@ -15,7 +15,8 @@ URDF = """<robot name="r"><link name="l"/>
 def patch(tmp_path: Path, text: str | bytes, root: str = "robot", names: list[str] | None = None):
     path = tmp_path / "robot.xml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return patched(path, root, names or ["b", "a"], [0.25, 0.5], [0.125, 1e-7])
+    found = DampingFit(tuple(names or "ba"), (0.25, 0.5), (0.125, 1e-7), (), ())
+    return patched(path, root, found)
 
 
 def test_joints_are_found_by_name_and_the_rest_stays(tmp_path: Path) -> None:
@@ -54,4 +55,4 @@ def test_huge_files_are_refused(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(2**28)  # sparse
     with pytest.raises(ValueError, match="too large"):
-        patched(path, "robot", ["a"], [1.0], [1.0])
+        patched(path, "robot", DampingFit(("a",), (1.0,), (1.0,), (), ()))

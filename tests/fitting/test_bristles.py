@@ -65,6 +65,7 @@ def test_a_batch_of_coefficients_gives_the_torque_of_each() -> None:
         np.testing.assert_allclose(torque, alone, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
     """Strokes of thousands of rad pass the presliding of 2 mrad within a sample, even near rest."""
     found = fit_torque(table_of("Dahl", reach=1e5), "dahl", folds=2)

@@ -168,6 +168,7 @@ def test_one_short_motion_is_no_evidence_of_a_change_of_friction(pushed, coeffic
     assert not any("friction of" in w for w in said)
 
 
+@pytest.mark.slow
 def test_a_mistake_is_named_at_a_high_rate_too():
     """Few blocks remained of many samples each."""
     plant, q, tau = measured("motor", None)
@@ -490,6 +491,7 @@ def test_a_fine_encoder_calls_no_small_error_doubtful(factor, verdict):
     assert found.usability[0] == verdict
 
 
+@pytest.mark.slow
 def test_an_encoder_without_visible_count_excuses_no_law():
     plant, smooth, tau = measured("wheel", None)
     recording = Recording(STEP * np.arange(len(smooth)), smooth, tau)

@@ -174,6 +174,7 @@ def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
     assert drag(fit_plant=False) == []
 
 
+@pytest.mark.slow
 def test_air_drag_is_told_from_joint_friction():
     """With drag in the recording, joint coefficients mean joints only where drag is fitted."""
     plant = pendulum()
@@ -490,6 +491,7 @@ def test_stribeck_friction_is_found_again():
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
 
 
+@pytest.mark.slow
 def test_no_search_is_made_twice(monkeypatch):
     """On a plant that is not fitted, torques lead again to where the search began."""
     begun, search = [], ShootingFitter.search
@@ -590,12 +592,9 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     assert not any("were skipped" in warning for warning in found.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "last",
-    [
-        pytest.param("0.5 s windows, coulomb_viscous law", marks=pytest.mark.slow),
-        "from the coulomb_viscous law",
-    ],
+    "last", ["0.5 s windows, coulomb_viscous law", "from the coulomb_viscous law"]
 )
 def test_what_stops_a_further_search_stops_the_fit_and_keeps_the_best(last):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)

@@ -96,6 +96,7 @@ def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
     assert ("windows of 0.5 s, to which its constant law was fitted" in found.status) is not kept
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 def test_a_law_that_is_not_linear_has_a_network_too(constant):
     recording, _ = constant
@@ -139,6 +140,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     assert moved() < min(1e-3, 0.1 * as_left)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 @pytest.mark.parametrize("freed", [False, True])
 def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monkeypatch, freed):
@@ -186,6 +188,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     assert torch.equal(last[3], best[3])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
     recording, law = with_plant

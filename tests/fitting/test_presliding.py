@@ -133,6 +133,7 @@ def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_
     assert 800 < stiffness < 3200
 
 
+@pytest.mark.slow
 def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
     """By all rows F_c is 0.42 and F_v 1.6: a contact that yields balances any torque."""
     time = 2e-3 * np.arange(2001)

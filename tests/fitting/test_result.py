@@ -80,6 +80,13 @@ def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> 
     assert all(line == line.rstrip() for line in told.splitlines())
 
 
+def test_a_result_is_printed_in_two_lines(found: FitResult) -> None:
+    head, warned = repr(replace(found, warnings=("Too short: 1 < 2.",))).splitlines()
+    assert head.startswith("FitResult of load-coulomb (LFM): good. Converged")
+    assert warned == "Warnings: 1; see `summary()`."
+    assert str(found) == repr(found)
+
+
 def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
     page = replace(found, warnings=("Too short: 1 < 2.",))._repr_html_()
     assert "load-coulomb (LFM): good" in page

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from nfriction.export.simulators import patched
+from nfriction.export.simulators import DampingFit, patched
 from nfriction.plant import PendulumChain, rigs
 
 mujoco = pytest.importorskip("mujoco")
@@ -209,8 +209,9 @@ def test_friction_that_we_export_leaves_the_rig_as_it_was(tmp_path):
         path = tmp_path / name
         path.write_text(text)
         plant = rigs.read(path)
-        ones = [0.5] * plant.joints
-        path.write_bytes(patched(path, root, plant.joint_names, ones, ones))
+        halves = (0.5,) * plant.joints
+        found = DampingFit(plant.joint_names, halves, halves, (), ())
+        path.write_bytes(patched(path, root, found))
         assert "0.5" in path.read_text()
         assert rigs.read(path).to_dict() == plant.to_dict()
 

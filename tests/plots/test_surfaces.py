@@ -32,6 +32,7 @@ def mesh_of(ax) -> QuadMesh:
     return mesh
 
 
+@pytest.mark.slow
 def test_maps_fade_as_they_become_uncertain(known):
     model, uncertainty = known
     figure = plots.coefficient_surfaces(model, uncertainty=uncertainty)

@@ -111,6 +111,7 @@ def error(soft: bool, steps: int) -> float:
     return float(np.abs(run.q[::steps].numpy() - solution(soft)).max())
 
 
+@pytest.mark.slow
 def test_a_contact_that_the_step_resolves_is_solved_to_second_order() -> None:
     coarse, fine = error(True, 25), error(True, 100)
     assert fine < 1e-5
@@ -252,6 +253,7 @@ def period(time: np.ndarray, velocity: np.ndarray) -> float:
     return float(np.diff(crossings).mean())
 
 
+@pytest.mark.slow
 def test_the_stick_slip_cycle_has_the_period_of_the_published_equations() -> None:
     f_c, f_d, v_s, stiffness, damping, viscous = CLASSIC
 

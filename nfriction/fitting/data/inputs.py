@@ -144,8 +144,8 @@ def in_joint_coordinates(
         joints = recording.q.shape[1]
         if joints != plant.joints or joints != modelled:
             raise ValueError(
-                f"{recording.name}: {joints} joints recorded, the plant has {plant.joints}, the "
-                f"model {modelled}; they must agree."
+                f"recording, plant and model must have as many joints, got {joints} in "
+                f"{recording.name}, {plant.joints} and {modelled}."
             )
     conventions = {str(r.resolve_convention(plant)) for r in recordings}
     # Residuals are formed as the encoders read, by one matrix for all windows.

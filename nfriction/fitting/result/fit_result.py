@@ -173,8 +173,7 @@ class FitResult:
             reasons.append(far)
         # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.
         names = set(self.model.schedule.parameter_names(self.plant.joint_names))
-        count = sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable)
-        if count:
+        if count := sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable):
             reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
@@ -210,7 +209,6 @@ class FitResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
-        seconds = self.rule_seconds()
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
         gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
@@ -231,7 +229,7 @@ class FitResult:
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
             **({"effective_parameters": gamma} if gamma else {}),
-            **({"rule_seconds": seconds} if seconds else {}),
+            **({"rule_seconds": seconds} if (seconds := self.rule_seconds()) else {}),
             **({"inputs": [asdict(gain) for gain in self.inputs]} if self.inputs else {}),
         }
 
@@ -263,11 +261,13 @@ class FitResult:
         """Model, usability, status and residual in a line."""
         name, (verdict, reason) = both_names(type(self.model).__name__), self.usability
         why = f" ({reason})" if reason else ""
-        unit = self.residual_unit
         return (
             f"{name}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
-            f"{1e3 * self.residual:.3g} m{unit} RMS over the training data."
+            f"{1e3 * self.residual:.3g} m{self.residual_unit} RMS over the training data."
         )
+
+    def __repr__(self) -> str:
+        return f"FitResult of {self._head()}\nWarnings: {len(self.warnings)}; see `summary()`."
 
     def summary(self) -> str:
         """Usability, status, coefficients with 95 % intervals, and warnings, as text."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.models import NamedModel
-from nfriction.friction.parameters import Sensitivity
+from nfriction.friction.parameters import Sensitivity, positive_number
 
 CLASSES = ("low", "medium", "high")
 
@@ -82,12 +82,8 @@ class Adaptive(Tabulated):
         super().__init__(law, joints, initial, (len(CLASSES),))
         if not 0 <= hysteresis < math.inf:
             raise ValueError(f"`hysteresis` must be 0 or more and finite, got {hysteresis}.")
-        if not 0 < time_constant < math.inf:
-            raise ValueError(
-                f"`time_constant` must be positive and finite [s], got {time_constant}."
-            )
         self.hysteresis = float(hysteresis)
-        self.time_constant = float(time_constant)
+        self.time_constant = positive_number("time_constant", time_constant, "s")
         borders = self.raw.detach().new_tensor([20.0, 100.0])
         self.register_buffer("thresholds", borders.repeat(joints, 1))
         self.register_buffer("swing_rate", torch.zeros_like(self.thresholds[:, 0]))
@@ -104,9 +100,7 @@ class Adaptive(Tabulated):
         Raises:
             ValueError: if it is not positive and finite.
         """
-        if not 0 < sample_time < math.inf:
-            raise ValueError(f"`sample_time` must be positive and finite [s], got {sample_time}.")
-        self.sample_time = float(sample_time)
+        self.sample_time = positive_number("sample_time", sample_time, "s")
         self.fading.fill_(math.exp(-self.sample_time / self.time_constant))
 
     @torch.no_grad()

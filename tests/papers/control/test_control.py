@@ -56,6 +56,7 @@ def test_true_friction_is_passive() -> None:
     assert (qd * friction.torque(qd, load, friction.coefficients(qd, qd)) >= 0).all()
 
 
+@pytest.mark.slow
 def test_three_links_stay_upright() -> None:
     runs = study.controlled(
         PLANT, study.true_friction(PLANT), {study.NONE: study.feedback(PLANT)}, seconds=2.0

@@ -56,6 +56,7 @@ def test_evolution_improves_and_prices_cost_rules() -> None:
         assert one.error == torque_error(one.controller, LINEAR, given, V_SMOOTH)
 
 
+@pytest.mark.slow
 def test_a_resumed_evolution_is_the_whole_one(tmp_path: Path) -> None:
     given, file = samples(), tmp_path / "kept.json"
     whole = evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=OPTIONS)

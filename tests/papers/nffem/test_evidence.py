@@ -100,6 +100,7 @@ def test_linear_regression_reaches_the_maximum_of_its_closed_form() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_group_of_its_own_for_the_strong_beats_one_alpha_for_all() -> None:
     gain, error = 0.0, {"one": 0.0, "two": 0.0}
     for seed in range(0, 100, 10):
@@ -138,6 +139,7 @@ def test_error_bars_cover_what_they_claim() -> None:
     assert 0.90 <= float(shares[1]) <= 0.98
 
 
+@pytest.mark.slow
 def test_error_bars_of_a_linear_model_cover_what_they_claim() -> None:
     inside = []
     for seed in range(100):

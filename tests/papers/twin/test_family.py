@@ -73,6 +73,7 @@ def test_every_effect_changes_the_motion(
     assert (apart > 10 * family.COUNT) == (truth != family.PLAIN)
 
 
+@pytest.mark.slow
 def test_steps_are_short_enough() -> None:
     coarse_and_fine = motions(TOGETHER, 500), motions(TOGETHER, 2000, step=2.5e-4)
     for coarse, fine in zip(*coarse_and_fine, strict=True):
@@ -129,6 +130,7 @@ def test_encoders_count(drawn: twin.Twin) -> None:
         assert np.abs(recording.q - drawn.truth[label].q).max() < 1.5 * family.COUNT
 
 
+@pytest.mark.slow
 def test_judged_releases_are_predictable() -> None:
     made = twin.draw("direction", seed=0, duration=2.0)
     motion = family._Motion(Links.of(made.plant), family.parameters("direction", 0))
