@@ -13,6 +13,7 @@ References:
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partialmethod
 from math import factorial
 
 _EXP_SERIES = [1.0 / factorial(k) for k in range(2, 14)]
@@ -167,17 +168,10 @@ class _Vectors:
     def _two(self, op: str, a: str | float, b: str | float) -> str:
         return self.body.let(f"{op} {self.real} {self._operand(a)}, {self._operand(b)}")
 
-    def add(self, a: str | float, b: str | float) -> str:
-        return self._two("fadd", a, b)
-
-    def sub(self, a: str | float, b: str | float) -> str:
-        return self._two("fsub", a, b)
-
-    def mul(self, a: str | float, b: str | float) -> str:
-        return self._two("fmul", a, b)
-
-    def div(self, a: str | float, b: str | float) -> str:
-        return self._two("fdiv", a, b)
+    add = partialmethod(_two, "fadd")
+    sub = partialmethod(_two, "fsub")
+    mul = partialmethod(_two, "fmul")
+    div = partialmethod(_two, "fdiv")
 
     def mul_add(self, a: str | float, b: str | float, c: str | float) -> str:
         return self.body.call("fmuladd", [self._operand(x) for x in (a, b, c)], self.width)

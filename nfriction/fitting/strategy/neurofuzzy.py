@@ -317,6 +317,13 @@ def network_evidence(end: HorizonResult) -> GroupEvidence:
     return group_evidence(*local_model(end), torch.ones(groups, dtype=torch.float64))
 
 
+def log_evidence(end: HorizonResult) -> float:
+    """Log evidence up to a constant, comparable at one noise; -inf where it is not finite."""
+    if not end.result.hessian.isfinite().all():
+        return -math.inf
+    return network_evidence(end).occam - float(end.result.cost)
+
+
 def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ...]:
     """Name of each group of a network, how many parameters the data determine, and its size."""
     if not torch.isfinite(end.result.hessian).all():
@@ -343,13 +350,6 @@ class Trial:
     def finite(self) -> bool:
         """False where the motion diverges."""
         return bool(self.squares.isfinite().all() and self.end.result.hessian.isfinite().all())
-
-    @cached_property
-    def log_evidence(self) -> float:
-        """Log evidence up to a constant, comparable at one noise; -inf where it is not finite."""
-        if not self.end.result.hessian.isfinite().all():
-            return -math.inf
-        return network_evidence(self.end).occam - float(self.end.result.cost)
 
 
 class Validation:
@@ -414,7 +414,7 @@ class Validation:
         stride = min(decimation(residuals, self.options), trial.end.problem.stride)
         held = self._adapted(trial, noise, stride, learn_sets=False)
         moved = self._adapted(held, noise, stride, learn_sets=True)
-        gained = moved.log_evidence - held.log_evidence
+        gained = log_evidence(moved.end) - log_evidence(held.end)
         better = moved if gained > self.options.evidence_gain else held
         judged = self.judged(replace(better, squares=self._errors(better.end)))
         if gains(judged.squares, trial.squares):
@@ -444,7 +444,7 @@ class Validation:
             if end.stopped:
                 raise StoppedError
             found = replace(trial, fitter=fitter, end=end, tolerance=tolerance)
-            gain = found.log_evidence - (best.log_evidence if best else -math.inf)
+            gain = log_evidence(found.end) - (log_evidence(best.end) if best else -math.inf)
             if not gain > self.options.evidence_gain:
                 break
             best, x = found, end.result.x

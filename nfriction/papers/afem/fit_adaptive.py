@@ -1,13 +1,15 @@
 """Fits of adaptive models: coefficients by class of acceleration (AFEM).
 
 During a search the classes are those of the measured motion, so the cost is smooth in the
-coefficients. What the search finds is then taken as far as it also improves simulations in which
-the class follows the simulated motion.
+coefficients. Evidence says how far classes deviate from the constant law, and whether they do at
+all. What the search finds is then taken as far as it also improves simulations in which the class
+follows the simulated motion.
 """
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -26,7 +28,8 @@ from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
-from nfriction.fitting.strategy.continuation import ShootingFitter
+from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
+from nfriction.fitting.strategy.neurofuzzy import log_evidence
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -43,6 +46,12 @@ logger = logging.getLogger(__name__)
 TOLERANCE = 1e-6
 # Shares of the classes' deviations from the constant law to try, largest first.
 SHARES = (1.0, 0.5, 0.25)
+# Widths of the classes' prior among which evidence chooses, in units of `prior_sd`: each is as
+# likely beforehand. At the first one the classes are the constant law.
+NARROWEST, WIDTHS = 1e-4, (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1.0)
+# Of a coefficient that is zero and has no scale [SI].
+LEAST_SD = 1e-9
+STOPPED = "Stopped before the classes were found"
 OPTIONS = FitOptions(windows=(0.5, 2.0))
 
 
@@ -60,9 +69,10 @@ def fit_adaptive(
     """Fit a model whose coefficients depend on the class of acceleration.
 
     As `nfriction.fit` does, with options for the classes. The constant law is fitted first. Every
-    class starts there and is pulled toward it, so a class with few data stays there; and where the
-    result simulates the training windows no better, with the class following the simulation, the
-    constant coefficients are kept.
+    class starts there and is pulled toward it, as strongly as evidence favours, so a class with few
+    data stays there. The constant coefficients are kept where classes gain too little evidence, or
+    where the result simulates the training windows no better, with the class following the
+    simulation.
 
     Args:
         model: the model to fit; changed in place.
@@ -113,19 +123,24 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     )
     vector = known_terms(constant, terms)
     sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
-    problem = GivenClassesProblem(
-        StepJacobian(task.plant, given, terms), given, windows, effective_noise(constant.residuals),
-        task.measurement, substeps=by_class.substeps, plant_prior=(vector, sd),
-        classes=by_class.drive(),
+    fitter = ClassFitter(
+        StepJacobian(task.plant, given, terms), given, task.recordings, task.measurement,
+        replace(options, patience=0), task.callback, plant_prior=(vector, sd),
+        classes=by_class.driving,
     )  # fmt: skip
-    fitter = ShootingFitter(
-        problem.jacobian, given, task.recordings, task.measurement, replace(options, patience=0),
-        task.callback,
-    )  # fmt: skip
-    name = f"{length:g} s windows, by class"
-    result = fitter.search(problem, problem.variables.start(vector), TOLERANCE, name).result
-    found = result_from_shooting(given, problem, result, task.motions)
-    q0, qd0 = problem.variables.split(result.x).states.chunk(2, -1)
+    noise, name = effective_noise(constant.residuals), f"{length:g} s windows, by class"
+    prior = by_class.table.prior()
+    end, gain = fitter.likeliest(windows, noise, vector, prior, name)
+    if end is not None and not gain > options.evidence_gain:
+        return by_class.constant_kept(f"By evidence classes gain too little ({gain:.2g} nats)")
+    if end is not None:
+        # Beside the law's error as noise, the prior would outweigh what classes explain.
+        noise = min(noise, max(effective_noise(end.residuals), options.min_noise))
+        end, _ = fitter.likeliest(windows, noise, vector, prior, name)
+    if end is None:
+        return by_class.constant_kept(STOPPED, converged=False)
+    found = result_from_shooting(given, end.problem, end.result, task.motions)
+    q0, qd0 = end.parts.states.chunk(2, -1)
     return by_class.backtracked(found, replace(windows, q0=q0, qd0=qd0), constant.residual)
 
 
@@ -152,21 +167,83 @@ class GivenClasses(Adaptive):
     def prior(self) -> tuple[Tensor, Tensor]:
         return self._mean, self._sd
 
+    def group_names(self) -> tuple[str, ...]:
+        return ("deviations by class",)
+
+    def groups(self) -> Tensor:
+        return torch.zeros(len(self._mean), dtype=torch.int64)
+
 
 @dataclass(frozen=True, eq=False)
 class GivenClassesProblem(ShootingProblem):
-    """A shooting problem whose coefficients follow given classes (window, step, joint)."""
+    """A shooting problem whose coefficients follow given classes.
 
-    classes: Tensor | None = None
+    Args:
+        classes: of every sample of each recording, (sample, joint).
+    """
+
+    classes: tuple[Tensor, ...] = ()
 
     def _integrate(self, plant: Plant, model: FrictionModel, inputs: RolloutInputs) -> Rollout:
-        assert self.classes is not None
-        classes = self.classes.repeat_interleave(self.substeps, 1)
+        classes = along(self.windows, self.classes).repeat_interleave(self.substeps, 1)
         # The schedule reads the class in place of the acceleration; velocity does not enter.
         measured = torch.zeros_like(classes), classes
         motion = integrate(plant, model, replace(inputs, measured=measured))
         # The derivatives of a step must be taken at the input that drove it.
         return replace(motion, qdd=torch.cat([classes, classes[:, -1:]], 1))
+
+
+@dataclass(frozen=True, eq=False)
+class ClassFitter(ShootingFitter):
+    """A fitter whose problems follow given classes, see `GivenClassesProblem`."""
+
+    classes: tuple[Tensor, ...] = ()
+
+    def problem(
+        self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
+    ) -> GivenClassesProblem:
+        """The problem of windows that starts at these friction parameters."""
+        posed = super().problem(windows, noise, friction, stride=stride)
+        own = {f.name: getattr(posed, f.name) for f in fields(posed)}
+        return GivenClassesProblem(**own, classes=self.classes)
+
+    def likeliest(
+        self,
+        windows: Windows,
+        noise: float,
+        plant: Tensor,
+        prior: tuple[Tensor, Tensor],
+        name: str,
+    ) -> tuple[HorizonResult | None, float]:
+        """The search at the width of the prior that evidence favours; None if stopped.
+
+        And the gain in log evidence over the constant law, of all widths together [nats]: the best
+        of several always seems to gain.
+        """
+        (mean, sd), x = prior, None
+        ends, evidence = [], []
+        for width in (NARROWEST, *WIDTHS):
+            fitter = replace(self, friction_prior=(mean, width * sd))
+            problem = fitter.problem(windows, noise, mean)
+            start = problem.variables.start(plant) if x is None else x
+            end = fitter.search(problem, start, TOLERANCE, name)
+            if end.stopped:
+                return None, 0.0
+            x = end.result.x
+            ends.append(end)
+            evidence.append(log_evidence(end))
+        law, *gains = evidence
+        among = torch.tensor(gains, dtype=torch.float64) - law
+        together = float(torch.logsumexp(among, 0)) - math.log(len(among))
+        return ends[1 + int(among.argmax())], together
+
+
+def along(windows: Windows, classes: Sequence[Tensor]) -> Tensor:
+    """Class that drives every step of windows, (window, step, joint)."""
+    driving = torch.zeros_like(windows.tau)
+    for w, (place, first, last) in enumerate(windows.spans):
+        driving[w, : last - first] = classes[place][first:last]
+    return driving
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,8 +366,8 @@ class ClassFit:
         values = constant.model.schedule.coefficient_sets()["always"]
         natural = coefficient_scale(model, constant.plant, joint, motions)
         sd = options.prior_sd * torch.maximum(values.abs(), natural)
-        # Where neither gives a size, the coefficient is free.
-        table = GivenClasses(model, values, torch.where(sd > 0, sd, torch.inf))
+        # Where neither gives a size, the coefficient is that of the law.
+        table = GivenClasses(model, values, sd.clamp_min(LEAST_SD))
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
         # Windows are compared in joint coordinates, without what the encoders are off by.
         corrected = replace(task, recordings=joint, motions=motions)
@@ -303,15 +380,12 @@ class ClassFit:
         longest = max(r.longest_step for r in self.task.recordings)
         return integration_substeps(self.task.plant, self.given, longest)
 
-    def drive(self) -> Tensor:
-        """Class that drives every step, a class with too few data as its neighbour."""
+    @property
+    def driving(self) -> tuple[Tensor, ...]:
+        """Class that drives each sample of a recording, one with too few data as its neighbour."""
         stands_for = self.classes.stands_for
         joints = torch.arange(len(stands_for))
-        driving = torch.zeros_like(self.windows.tau)
-        for w, (place, first, last) in enumerate(self.windows.spans):
-            known = stands_for[joints, self.classes.labels[place][first:last]]
-            driving[w, : last - first] = known.to(driving.dtype)
-        return driving
+        return tuple(stands_for[joints, known].double() for known in self.classes.labels)
 
     def backtracked(self, found: FitResult, windows: Windows, baseline: float) -> FitResult:
         """The fit `found` as far as it improves on `baseline` [rad], the constant law's error.
@@ -345,7 +419,17 @@ class ClassFit:
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)
                 taken = replace(found, residual=rms, residuals=residuals, status=status)
                 return taken.with_warnings(constant.data_warnings)
-        # All classes equal: the adaptive model then is the constant one.
-        schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
-        status = f"{constant.status} The classes simulate no better: the constant law is kept."
-        return replace(constant, model=model, motions=self.motions, status=status)
+        return self.constant_kept("The classes simulate no better")
+
+    def constant_kept(self, reason: str, *, converged: bool = True) -> FitResult:
+        """The constant fit as that of the adaptive model, all classes of which are equal."""
+        model, constant = self.task.model.requires_grad_(False), self.constant
+        flat = constant.model.schedule.coefficient_sets()["always"][:, None]
+        self.schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
+        kept = replace(constant, model=model, motions=self.motions)
+        note = f"{reason}: the constant law is kept."
+        return replace(
+            kept,
+            status=f"{constant.status} {note}" if converged else f"Not converged: {note}",
+            converged=constant.converged and converged,
+        )

@@ -30,7 +30,7 @@ from nfriction.optim import bounded_qp
 from nfriction.optim.least_squares import Quadratic
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import DEFAULTS, ClassOptions
-from nfriction.papers.afem.fit_adaptive import ClassFit, PositionError, like_start
+from nfriction.papers.afem.fit_adaptive import ClassFit, PositionError, along, like_start
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -481,7 +481,7 @@ def fit_by_search(
     error = PositionError(
         constant.plant, varied, windows, task.measurement,
         integration_substeps(plant, varied, step), threads=options.threads or _processors(),
-        drive=None if by_class is None else by_class.drive(),
+        drive=None if by_class is None else along(windows, by_class.driving),
     )  # fmt: skip
     box = _box(table, varied, constant, task)
     objective = _Objective.of(error, table)

@@ -210,11 +210,6 @@ class RBFCoefficients(Schedule):
         weight.copy_(layer[..., :-1])
         bias.copy_(layer[..., -1])
 
-    def joint_of_parameters(self) -> Tensor:
-        """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
-        size = self.parameter_vector().numel() // self.joints
-        return torch.arange(self.joints).repeat_interleave(size)
-
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]

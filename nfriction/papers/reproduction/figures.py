@@ -8,7 +8,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.model_file import load
@@ -163,6 +163,31 @@ def group_positions(
     recording = next(r for r in workspace.bench("tlrip").test if r.name == SHOWN)
     simulated = {name: workspace.arrays(name)[SHOWN] for name in among}
     return _on_one_scale(recording, simulated, models)
+
+
+def fresh_errors(workspace: Workspace) -> Figure:
+    """Errors over fresh releases, a panel a joint: all, the middle half, the median."""
+    errors = tables.fresh_runs(workspace, tables.NINE)
+    figure, axes = style.panels(1, len(tables.JOINTS), style.PAGE, 2.3, sharex=True, sharey=True)
+    places, looks = range(len(errors)), style.looks(errors)
+    for joint, (ax, name) in enumerate(zip(axes[0], tables.JOINTS, strict=True)):
+        runs = 1e3 * np.stack(list(errors.values()))[..., joint]
+        for k, (model, own) in enumerate(zip(errors, runs, strict=True)):
+            # Without interpolation: a diverged run is infinitely wrong.
+            least, low, high, most = np.percentile(own, [0, 25, 75, 100], method="nearest")
+            colour = looks[model].line["color"]
+            ax.plot([least, most], [k, k], color=colour, linewidth=0.8)
+            ax.plot([low, high], [k, k], color=colour, linewidth=3.5, solid_capstyle="butt")
+            ax.plot(np.median(own), k, "o", color=style.INK, markersize=3.5, zorder=4)
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.set_yticks(places, list(errors))
+        ax.set_ylim(len(errors) - 0.5, -0.5)
+        ax.set_xlabel("position RMSE [mrad]")
+        style.title(ax, name)
+    return figure
 
 
 def second_torque(workspace: Workspace) -> Figure:

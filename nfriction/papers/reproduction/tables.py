@@ -24,7 +24,7 @@ from nfriction.papers.reproduction.stages import (
     PAPERS_WAY,
     SECOND_PAPER,
 )
-from nfriction.papers.reproduction.workspace import Workspace
+from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import rigs
 
 Drive = Literal["free_run", "measured_drive"]
@@ -92,9 +92,15 @@ def rmse(
 
 def fresh(workspace: Workspace, models: Sequence[str] = TLRIP) -> pd.DataFrame:
     """Median position RMSE of free runs over fresh releases, a row a model [rad]."""
+    found = fresh_runs(workspace, models)
+    return _table({name: np.median(errors, axis=0) for name, errors in found.items()})
+
+
+def fresh_runs(workspace: Workspace, models: Sequence[str]) -> dict[str, Array]:
+    """Position RMSE of each free run from a fresh release by model [rad], (release, joint)."""
     found = {n: np.array(workspace.found(n)["fresh"], dtype=float) for n in models}
     # A diverged simulation has no number: its error is infinite.
-    return _table({n: np.median(np.nan_to_num(e, nan=np.inf), axis=0) for n, e in found.items()})
+    return {n: np.nan_to_num(e, nan=np.inf) for n, e in found.items()}
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
@@ -188,7 +194,7 @@ def steps_saved(workspace: Workspace) -> pd.DataFrame:
 
 
 def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """Error of the first model of each pair below the second's [%], a row a pair."""
+    """Median error of the first model of each pair below the second's [%], a row a pair."""
 
     def saved(table: pd.DataFrame) -> pd.DataFrame:
         rows = {
@@ -199,7 +205,7 @@ def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.Dat
         }
         return pd.DataFrame(rows).T
 
-    return _beside(saved(rmse(workspace, TLRIP)), saved(_table(_PRINTED_10)))
+    return _beside(saved(fresh(workspace)), saved(_table(_PRINTED_10)))
 
 
 def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:

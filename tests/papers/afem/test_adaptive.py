@@ -164,6 +164,7 @@ def test_options_rebuild_the_memory() -> None:
     [
         ({"hysteresis": -0.1}, "hysteresis"),
         ({"time_constant": 0.0}, "time_constant"),
+        ({"time_constant": None}, "time_constant"),
         ({"sample_time": float("nan")}, "sample_time"),
         ({"initial": [[1.0, 1.0]] * 3}, "whole table"),
         ({"initial": [1.0, -1.0]}, "not negative"),

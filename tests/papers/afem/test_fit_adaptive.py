@@ -106,6 +106,25 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
     assert found.residual <= constant.residual * (1 + 1e-9)
 
 
+def test_classes_that_only_fit_the_noise_are_not_taken():
+    plant, truth = pendulum(), LFM(2, [3e-3, 4e-3], v_smooth=V_SMOOTH)
+    train = [swing(plant, truth, start=start) for start in ((2.6, 0.2), (0.9, -0.5))]
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fit(model, plant, train, fit_plant=False, windows=(1.0,))
+    assert "By evidence classes gain too little" in found.status
+    low, medium, high = model.schedule.coefficient_sets().values()
+    torch.testing.assert_close(low, high, rtol=0, atol=0)
+    torch.testing.assert_close(low, medium, rtol=0, atol=0)
+
+
+def test_a_fit_that_is_stopped_keeps_the_constant_law(case):
+    plant, train, _, motions, constant = case
+    found = fit_adaptive(ALFM(2), plant, train, start=constant, motions=motions,
+                         callback=lambda name, step: True)  # fmt: skip
+    assert not found.converged
+    assert "Stopped before the classes were found" in found.status
+
+
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
     constant = case[-1]
     monkeypatch.setattr("nfriction.papers.afem.fit_adaptive.PositionError.residuals",
@@ -125,9 +144,13 @@ def test_gradient_by_class_against_finite_differences(substeps):
     given = FrictionModel(model.law, GivenClasses(model, 4e-3 * one, 1e-3 * one), 0.1)
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     of = windows()
-    classes = (torch.arange(of.tau.numel()).reshape(of.tau.shape) // 7 % 3).to(F64)
+    samples = 1 + max(last for _, _, last in of.spans)
+    classes = (torch.arange(2 * samples).reshape(samples, 2) // 7 % 3).to(F64)
     jacobian = StepJacobian(plant, given, terms)
-    p = GivenClassesProblem(jacobian, given, of, 1e-3, ABSOLUTE, substeps=substeps, classes=classes)
+    p = GivenClassesProblem(
+        jacobian, given, of, 1e-3, ABSOLUTE, substeps=substeps,
+        classes=(classes,) * (1 + max(place for place, _, _ in of.spans)),
+    )  # fmt: skip
     x = point(p)
     gradient = p.linearise(x).gradient
     for i in range(p.variables.shared_count):

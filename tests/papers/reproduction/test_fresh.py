@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nfriction import NCFM
-from nfriction.papers.reproduction import fresh, tables
+from nfriction.papers.reproduction import figures, fresh, tables
 from nfriction.papers.twin.dataset import Encoder, specification
 from nfriction.papers.twin.mechanics import Links, simulate
 from nfriction.plant import rigs
@@ -49,3 +49,12 @@ def test_fresh_releases_can_be_predicted(pose: tuple[float, float, float]) -> No
         for e in (0.0, count)
     )
     assert np.abs(off - true).max() <= 16 * count
+
+
+def test_the_figure_shows_the_medians_of_the_table(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {"NFNCFM": 0.5, "LFM": None})
+    figure = figures.fresh_errors(made)
+    medians = tables.fresh(made, tables.NINE)
+    for ax, joint in zip(figure.axes, tables.JOINTS, strict=True):
+        dots = [float(line.get_xdata()[0]) for line in ax.lines if line.get_marker() == "o"]
+        np.testing.assert_allclose(dots, 1e3 * medians[joint])
