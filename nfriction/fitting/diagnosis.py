@@ -440,22 +440,12 @@ def changing_friction(
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
-    rest = torch.zeros_like(data.q)
-    static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
     for j in np.flatnonzero(data.tau.abs().amax(0)).tolist():
-        speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
-        knots = torch.quantile(speed, torch.linspace(0, 1, SPEED_KNOTS, dtype=speed.dtype))
-        shapes = [ones, *((speed - knot).clamp_min(0) for knot in knots[:-1]), data.tau[:, j].abs()]
-        friction = torch.stack([torch.sign(data.qd[:, j]) * shape for shape in shapes], 1)
-        rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
-        late = rate.repeat_interleave(data.block)
-        of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
-        # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
-        apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
-        sliding = apart & (data.moving()[:, j] > 0)
+        friction, of_rig, sliding = _of_sliding(plant, data, j, options)
         if (count := int(sliding.sum())) < 2 * pieces:
             continue
-        terms = [data.mean(x)[sliding] for x in (friction, of_rig, data.tau[:, [j]], data.time)]
+        means = friction, of_rig, data.mean(data.tau[:, [j]]), data.mean(data.time)
+        terms = [x[sliding] for x in means]
         if not all(bool(x.isfinite().all()) for x in terms):
             continue
         # Per time of sliding, in pieces that all have some: rest says nothing.
@@ -472,6 +462,74 @@ def changing_friction(
                 f"{abs(change):.2g} % (within {sd * student_quantile(pieces - 1, 0.975):.2g} %) "
                 "during a recording (warm-up, payload); intervals do not count that."
             )
+
+
+def loose_loads(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> Iterator[str]:
+    """A sentence for each driven joint whose load is loose after it reverses: play in a gear.
+
+    For the arguments see `likely_mistakes`. In the play a drive accelerates its rotor alone, so the
+    torque of the load is missing after it reversed, but not before; a wrong rig, law or delay shows
+    in both. Bristles change their torque where the velocity reverses, and that is left out. The
+    share that is missing has to exceed its scatter with each piece of the sliding left out, and be
+    most of the load: a delay of the friction alone looks like a lesser share.
+    """
+    own, pieces = dict(plant.named_buffers()), options.drift_pieces * len(recordings)
+    # Every block, since a reversal lies between neighbours.
+    every = replace(options, diagnosis_samples=sum(map(len, recordings)))
+    data = _collect(recordings, motions, every)
+    driven = np.flatnonzero(data.tau.abs().amax(0)).tolist()
+    terms = [x.change for x in plant_parameters(plant, driven=driven, options=options) if x.ratio]
+    rigs = [plant.replace(**{k: own[k] + x for k, x in change.items()}) for change in terms]
+    needed, wrong = data.needed(plant), [data.needed(rig) for rig in rigs]
+    elapsed = data.mean(data.time)[:, 0].diff()
+    beside = (elapsed > 0) & (elapsed < 1.5 * elapsed.median())
+    for j in (k for k in driven if "armature" in own and own["armature"][k] > 0):
+        friction, of_rig, sliding = _of_sliding(plant, data, j, options)
+        load = needed[:, j] - own["armature"][j] * data.qdd[:, j]
+        more = [torch.sign(data.qd[:, j]) * load.abs(), data.qdd[:, j], *(x[:, j] for x in wrong)]
+        load = data.mean(load)
+        turned = torch.nn.functional.pad((load[1:] * load[:-1] < 0) & beside, (1, 1))
+        near = torch.stack([load * turned[1:], load * turned[:-1]], 1)
+        known = torch.cat([friction, of_rig, data.mean(torch.stack(more, 1)), near], 1)[sliding]
+        torque = data.mean(data.tau[:, j])[sliding]
+        if int(turned[:-1][sliding].sum()) < pieces // 2 or not bool(known.isfinite().all()):
+            continue
+        # Without their scale, as most terms of a simple rig are sums of others.
+        scale = known.square().mean(0).sqrt().clamp_min(torch.finfo(known.dtype).tiny)
+        piece, found = torch.arange(len(known)) * pieces // len(known), []
+        for seen in (piece != k for k in range(-1, pieces)):
+            least = torch.linalg.lstsq(
+                (known / scale)[seen], torque[seen], rcond=1e-9, driver="gelsd"
+            )
+            found.append(-float(least.solution[-1] / scale[-1]))
+        share, sd = found[0], math.sqrt((pieces - 1) * np.var(found[1:]))
+        sure, within = (student_quantile(pieces - 1, 1 - x) for x in (options.drift_chance, 0.025))
+        if share > max(sd * sure, 0.5 + sd * within):
+            yield (
+                f"The load of {plant.joint_names[j]} is loose after it reverses: {100 * share:.0f} "
+                f"% (within {100 * sd * within:.0f} %) of its torque is missing for some "
+                f"{options.diagnosis_block:g} s (play in a gear); intervals do not count that."
+            )
+
+
+def _of_sliding(
+    plant: Plant, data: _Data, j: int, options: FitOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Means of terms that explain a joint's torque, of friction and rig, and blocks of sliding."""
+    rest = torch.zeros_like(data.q)
+    static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
+    speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
+    knots = torch.quantile(speed, torch.linspace(0, 1, SPEED_KNOTS, dtype=speed.dtype))
+    shapes = [ones, *((speed - knot).clamp_min(0) for knot in knots[:-1]), data.tau[:, j].abs()]
+    friction = torch.stack([torch.sign(data.qd[:, j]) * shape for shape in shapes], 1)
+    rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
+    late = rate.repeat_interleave(data.block)
+    of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
+    # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
+    apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
+    return data.mean(friction), data.mean(of_rig), apart & (data.moving()[:, j] > 0)
 
 
 def _growth(

@@ -25,6 +25,7 @@ from nfriction.fitting.diagnosis import (
     balanced_delay,
     changing_friction,
     likely_mistakes,
+    loose_loads,
     mistake_warning,
 )
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
@@ -113,8 +114,9 @@ def prepare_task(
     stated, mistakes = likely_mistakes(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
+    of = plant, advanced, moved, options
     found = (
-        *(mistake_warning(stated, mistakes) or changing_friction(plant, advanced, moved, options)),
+        *(mistake_warning(stated, mistakes) or (*changing_friction(*of), *loose_loads(*of))),
         *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
     )

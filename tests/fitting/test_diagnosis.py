@@ -120,6 +120,32 @@ def warming(change: float, chirp: bool) -> tuple[np.ndarray, np.ndarray]:
     return COUNT * np.round(q / COUNT), tau + 0.01 * noise
 
 
+@functools.cache
+def geared(play: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and torques of the motor with this play between its rotor and the link."""
+    given, tau, steps = PendulumChain(**MOTOR), torque([3.0], 5), 20
+    link, weight = float(given.inertia_coupling[0, 0]), float(given.gravity_moment.sum())
+    h, (q, qd, link_q, link_qd), seen = STEP / steps, np.zeros(4), []
+    for u in tau[:, 0].tolist():
+        seen.append(q)
+        for _ in range(steps):
+            pressed = max(abs(q - link_q) - play / 2, 0.0)
+            tooth = math.copysign(2000 * pressed, q - link_q) + (pressed > 0) * 0.4 * (qd - link_qd)
+            rub = 0.25 * math.tanh(qd / 3e-3) + 0.08 * qd
+            qd += h * (u - tooth - rub) / 0.05
+            link_qd += h * (tooth - weight * math.sin(link_q)) / link
+            q, link_q = q + h * qd, link_q + h * link_qd
+    noise = np.random.default_rng(0).normal(size=tau.shape)
+    return COUNT * np.round(np.array(seen)[:, None] / COUNT) + math.pi, tau + 0.01 * noise
+
+
+@pytest.mark.parametrize(("play", "named"), [(1.0, True), (0.0, False)])
+def test_play_in_a_gear_is_named(play, named):
+    said = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
+    shares = [re.search(r"joint1 is loose after it reverses: (\d+) % ", w) for w in said]
+    assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
+
+
 @pytest.mark.parametrize("change", [0.3, -0.3])
 def test_a_friction_that_changes_within_a_recording_is_named(change):
     said = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
@@ -133,7 +159,8 @@ def test_a_friction_that_changes_within_a_recording_is_named(change):
 @pytest.mark.parametrize("mass", [1.0, 1.1])
 def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp, mass):
     plant = PendulumChain(**MOTOR | {"mass": [mass]})
-    assert not any("friction of" in w for w in warnings_of(plant, *warming(0.0, chirp)))
+    said = warnings_of(plant, *warming(0.0, chirp))
+    assert not any("friction of" in w or "loose" in w for w in said)
 
 
 @pytest.mark.parametrize(
