@@ -172,7 +172,10 @@ class FitResult:
         if wrong:
             reasons.append(far)
         # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.
-        names = set(self.model.schedule.parameter_names(self.plant.joint_names))
+        joints, schedule = self.plant.joint_names, self.model.schedule
+        # Names of the constant law, too: it may be kept instead of a network or classes.
+        law = {f"{name} of {joint}" for name in schedule.coefficient_names for joint in joints}
+        names = law.union(schedule.parameter_names(joints))
         if count := sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable):
             reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
@@ -243,12 +246,15 @@ class FitResult:
 
         joints, schedule = self.plant.joint_names, self.model.schedule
         rows: dict[str, tuple[float, float, float]] = {}
+        known = {i.name: (i.value, i.low, i.high) for i in self.intervals}
         for label, values in schedule.coefficient_sets().items():
             where = "" if label == "always" else f", {label.replace('_', ' ')}"
             for joint, of_joint in zip(joints, values.tolist(), strict=True):
                 for name, value in zip(schedule.coefficient_names, of_joint, strict=True):
-                    rows[f"{name} of {joint}{where}"] = (value, math.nan, math.nan)
-        rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
+                    # Where the constant law is kept, its coefficient applies everywhere.
+                    own = f"{name} of {joint}"
+                    rows[own if own in known else own + where] = (value, math.nan, math.nan)
+        rows |= known
         table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
         unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
         table["note"] = [

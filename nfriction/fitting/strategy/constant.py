@@ -14,14 +14,9 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.equation_error import (
-    TorqueFit,
-)
+from nfriction.fitting.equation_error import TorqueFit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.of_search import (
-    result_from_equation_error,
-    result_from_shooting,
-)
+from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (

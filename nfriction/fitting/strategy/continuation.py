@@ -113,12 +113,7 @@ class ShootingFitter:
         return cut_windows(self.recordings, motions, length, rest_speed=rest_speed)
 
     def problem(
-        self,
-        windows: Windows,
-        noise: float,
-        friction: Tensor,
-        *,
-        stride: int = 1,
+        self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
     ) -> ShootingProblem:
         """The problem of windows that starts at these friction parameters."""
         model = model_at(self.friction, friction)

@@ -502,7 +502,7 @@ class Validation:
 def constant_kept(
     start: FitResult, model: FrictionModel, note: str, *, converged: bool = True
 ) -> FitResult:
-    """The constant fit as that of a network's model, which is its law; a note gives the reason."""
+    """The constant fit as that of a model, which is its law; a note gives the reason."""
     return replace(
         start,
         model=model.requires_grad_(False),

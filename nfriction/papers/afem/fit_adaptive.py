@@ -29,7 +29,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
-from nfriction.fitting.strategy.neurofuzzy import log_evidence
+from nfriction.fitting.strategy.neurofuzzy import constant_kept, log_evidence
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -132,13 +132,13 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     prior = by_class.table.prior()
     end, gain = fitter.likeliest(windows, noise, vector, prior, name)
     if end is not None and not gain > options.evidence_gain:
-        return by_class.constant_kept(f"By evidence classes gain too little ({gain:.2g} nats)")
+        return by_class.kept(f"By evidence classes gain too little ({gain:.2g} nats)")
     if end is not None:
         # Beside the law's error as noise, the prior would outweigh what classes explain.
         noise = min(noise, max(effective_noise(end.residuals), options.min_noise))
         end, _ = fitter.likeliest(windows, noise, vector, prior, name)
     if end is None:
-        return by_class.constant_kept(STOPPED, converged=False)
+        return by_class.kept(STOPPED, converged=False)
     found = result_from_shooting(given, end.problem, end.result, task.motions)
     q0, qd0 = end.parts.states.chunk(2, -1)
     return by_class.backtracked(found, replace(windows, q0=q0, qd0=qd0), constant.residual)
@@ -208,12 +208,7 @@ class ClassFitter(ShootingFitter):
         return GivenClassesProblem(**own, classes=self.classes)
 
     def likeliest(
-        self,
-        windows: Windows,
-        noise: float,
-        plant: Tensor,
-        prior: tuple[Tensor, Tensor],
-        name: str,
+        self, windows: Windows, noise: float, plant: Tensor, prior: tuple[Tensor, Tensor], name: str
     ) -> tuple[HorizonResult | None, float]:
         """The search at the width of the prior that evidence favours; None if stopped.
 
@@ -232,10 +227,9 @@ class ClassFitter(ShootingFitter):
             x = end.result.x
             ends.append(end)
             evidence.append(log_evidence(end))
-        law, *gains = evidence
-        among = torch.tensor(gains, dtype=torch.float64) - law
-        together = float(torch.logsumexp(among, 0)) - math.log(len(among))
-        return ends[1 + int(among.argmax())], together
+        law, among = torch.tensor(evidence, dtype=torch.float64).split([1, len(WIDTHS)])
+        together = among.logsumexp(0) - math.log(len(among)) - law
+        return ends[1 + int(among.argmax())], float(together)
 
 
 def along(windows: Windows, classes: Sequence[Tensor]) -> Tensor:
@@ -419,17 +413,12 @@ class ClassFit:
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)
                 taken = replace(found, residual=rms, residuals=residuals, status=status)
                 return taken.with_warnings(constant.data_warnings)
-        return self.constant_kept("The classes simulate no better")
+        return self.kept("The classes simulate no better")
 
-    def constant_kept(self, reason: str, *, converged: bool = True) -> FitResult:
+    def kept(self, reason: str, *, converged: bool = True) -> FitResult:
         """The constant fit as that of the adaptive model, all classes of which are equal."""
-        model, constant = self.task.model.requires_grad_(False), self.constant
-        flat = constant.model.schedule.coefficient_sets()["always"][:, None]
+        flat = self.constant.model.schedule.coefficient_sets()["always"][:, None]
         self.schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
-        kept = replace(constant, model=model, motions=self.motions)
-        note = f"{reason}: the constant law is kept."
-        return replace(
-            kept,
-            status=f"{constant.status} {note}" if converged else f"Not converged: {note}",
-            converged=constant.converged and converged,
-        )
+        note = f"{reason}; the constant law is kept."
+        kept = constant_kept(self.constant, self.task.model, note, converged=converged)
+        return replace(kept, motions=self.motions)

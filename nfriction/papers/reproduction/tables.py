@@ -194,7 +194,7 @@ def steps_saved(workspace: Workspace) -> pd.DataFrame:
 
 
 def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """Median error of the first model of each pair below the second's [%], a row a pair."""
+    """Error of the first model of each pair below the second's, by medians [%], a row a pair."""
 
     def saved(table: pd.DataFrame) -> pd.DataFrame:
         rows = {

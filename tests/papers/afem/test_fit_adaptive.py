@@ -1,5 +1,9 @@
 """Adaptive fits recover coefficients by class and never serve worse than the constant law."""
 
+import math
+from dataclasses import replace
+from itertools import cycle
+
 import pytest
 import torch
 
@@ -123,6 +127,27 @@ def test_a_fit_that_is_stopped_keeps_the_constant_law(case):
                          callback=lambda name, step: True)  # fmt: skip
     assert not found.converged
     assert "Stopped before the classes were found" in found.status
+
+
+@pytest.mark.parametrize(("of_class", "kept"), [(3.0, False), (-math.inf, True)])
+def test_a_prior_under_which_the_motion_diverges_is_not_chosen(case, monkeypatch, of_class, kept):
+    """The evidence of the constant law diverges too: differences would be no numbers."""
+    evidence = cycle([-math.inf, -math.inf, of_class, -math.inf, -math.inf, -math.inf])
+    monkeypatch.setattr("nfriction.papers.afem.fit_adaptive.log_evidence", lambda _: next(evidence))
+    assert ("gain too little" in fitted(case, max_steps=2).status) == kept
+
+
+def test_a_constant_law_that_is_kept_is_told_once_with_its_intervals_and_doubts(case):
+    constant = replace(case[-1], unidentifiable=("B of joint1",))
+    found = fit_adaptive(ALFM(2), *case[:2], start=constant, motions=case[3],
+                         callback=lambda name, step: True)  # fmt: skip
+    table = found.to_pandas()
+    assert list(table.index[:4]) == [f"{c} of joint{j}" for j in (1, 2) for c in "BC"]
+    assert not any(", high" in name for name in table.index)
+    assert table["low"].notna().all()
+    settled = replace(found, mistakes=(), converged=True)
+    assert "the data do not determine 1 parameter" in settled.usability[1]
+    assert any("the constant law is kept" in warning for warning in found.warnings)
 
 
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
