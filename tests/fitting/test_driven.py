@@ -61,7 +61,6 @@ def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_
         )
 
 
-@pytest.mark.slow
 def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
     plant = geared()
     truth = plant.replace(torque_gain=torch.tensor([1.0, 0.85], dtype=F64))
@@ -78,7 +77,6 @@ def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
     )
 
 
-@pytest.mark.slow
 def test_what_gears_lose_is_told_from_dry_friction():
     plant = geared()
     truth = plant.replace(gear_loss=torch.tensor([0.05, 0.12], dtype=F64))

@@ -170,11 +170,14 @@ def fresh_errors(workspace: Workspace) -> Figure:
     errors = tables.fresh_runs(workspace, tables.NINE)
     figure, axes = style.panels(1, len(tables.JOINTS), style.PAGE, 2.3, sharex=True, sharey=True)
     places, looks = range(len(errors)), style.looks(errors)
+    finite = [own[np.isfinite(own)] for own in errors.values()]
+    beyond = 1e4 * float(np.concatenate(finite).max(initial=1e-3))
     for joint, (ax, name) in enumerate(zip(axes[0], tables.JOINTS, strict=True)):
         runs = 1e3 * np.stack(list(errors.values()))[..., joint]
         for k, (model, own) in enumerate(zip(errors, runs, strict=True)):
-            # Without interpolation: a diverged run is infinitely wrong.
-            least, low, high, most = np.percentile(own, [0, 25, 75, 100], method="nearest")
+            # Without interpolation: a diverged run is infinitely wrong, and ends beyond all others.
+            ends = np.percentile(own, [0, 25, 75, 100], method="nearest")
+            least, low, high, most = np.minimum(ends, beyond)
             colour = looks[model].line["color"]
             ax.plot([least, most], [k, k], color=colour, linewidth=0.8)
             ax.plot([low, high], [k, k], color=colour, linewidth=3.5, solid_capstyle="butt")

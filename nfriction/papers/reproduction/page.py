@@ -197,7 +197,7 @@ def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
 
 
 def text(workspace: Workspace) -> str:
-    """All tables beside the printed ones, and whether the papers' order of models holds."""
+    """All tables beside the printed ones, and how the fits ended."""
     parts = [
         f"{caption}\n"
         + _shown(caption, table).to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
@@ -208,8 +208,7 @@ def text(workspace: Workspace) -> str:
         "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
         "(fuzzy controller, 2-10-2 network), -pattern: by their pattern search."
     )
-    ends = tables.fit_ends(workspace)
-    return "\n\n".join([*parts, str(tables.order(workspace)), f"how the fits ended\n{ends}"])
+    return "\n\n".join([*parts, f"how the fits ended\n{tables.fit_ends(workspace)}"])
 
 
 def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
@@ -243,7 +242,7 @@ def write_page(workspace: Workspace) -> Path:
     template = jinja2.Environment(autoescape=True).from_string(_TEMPLATE.read_text("utf-8"))
     page = template.render(
         parts=parts, style=_STYLE.read_text(encoding="utf-8"), version=__version__,
-        conclusion=tables.conclusion(workspace).splitlines(), order=str(tables.order(workspace)),
+        conclusion=tables.conclusion(workspace).splitlines(),
         fits=tables.fit_ends(workspace), settings=workspace.settings.to_dict(),
     )  # fmt: skip
     return write_atomically(workspace.folder / PAGE, page.encode())

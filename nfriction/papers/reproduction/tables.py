@@ -291,7 +291,7 @@ def _unconverged(workspace: Workspace) -> list[str]:
 
 
 def conclusion(workspace: Workspace) -> str:
-    """Six lines for a stranger to the papers: what was reproduced, what was not, and why."""
+    """Lines for a stranger to the papers: what was reproduced, what was not, and why."""
     error = pd.concat([fresh(workspace), rmse(workspace, SECOND_PAPER)]).mean(axis=1)
 
     def said(names: Sequence[str]) -> str:
@@ -320,6 +320,7 @@ def conclusion(workspace: Workspace) -> str:
             f"networks fitted to trajectories err less still, {said(NEURO_FUZZY)}",
             NEURO_FUZZY, ADAPTIVE,
         ),
+        str(order(workspace)),
         claim(
             "networks taught by a fuzzy controller, the papers' own way, err less than "
             f"coefficients by class, {said(PAPERS_WAY)}",
