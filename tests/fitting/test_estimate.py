@@ -318,8 +318,8 @@ def test_what_does_not_match_is_refused():
     other = swing(pendulum(), true_model(), seconds=0.5, convention="absolute,hanging", name="o")
     for arguments, message in (
         ((LFM(2), pendulum(), []), "at least one recording"),
-        ((LFM(3), pendulum(), recording), "must agree"),
-        ((LFM(2), LinearAxis(1.0), recording), "must agree"),
+        ((LFM(3), pendulum(), recording), "as many joints"),
+        ((LFM(2), LinearAxis(1.0), recording), "as many joints"),
         ((LFM(2), pendulum(), [recording, other]), "convention"),
         ((LFM(2), pendulum(), replace(recording, unit="m")), "swing is in m, .* in rad"),
         ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
