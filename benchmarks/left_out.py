@@ -1,6 +1,7 @@
 """Parts of real recordings left out, and simulated by what the rest taught."""
 
 import math
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -267,9 +268,11 @@ class Contest:
         zeroed = not known and self.of.encoder_reference == "per_recording"
         for one in left:
             given = one.initial_state if isinstance(one, Left) else None
-            into[name].append(
-                score(plant, model, one.recording, initial_state=given, zeroed=zeroed)
-            )
+            found = score(plant, model, one.recording, initial_state=given, zeroed=zeroed)
+            into[name].append(found)
+            # A fold can take many minutes.
+            error = f"{1e3 * found.free_run.all:.3g} {self.of.unit}"
+            print(f"{name}: free run of {one.recording.name} {error}", file=sys.stderr, flush=True)
 
 
 def in_blocks(fold: Fold) -> bool:
