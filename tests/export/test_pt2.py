@@ -15,8 +15,8 @@ from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import motion, named_models
 
 MODELS = named_models()
-# Each schedule once; the others only among the slow tests, as an export takes seconds.
-QUICK = ["NLFM", "ALFM", "NFLFM"]
+# The others only among the slow tests, as an export takes seconds.
+QUICK = ["NLFM", "NFLFM"]
 
 
 @pytest.fixture(scope="module")

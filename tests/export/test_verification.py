@@ -64,8 +64,7 @@ ONE, ALL = {"f_a"}, {"f_c", "f_v", "f_a", "f_b"}
     [
         *(("c", ONE), ("c float", ONE), ("pt", ONE), ("c", ALL), ("c float", ALL), ("pt", ALL)),
         # The same arithmetic as a `.pt`, in forms that take long to write.
-        ("onnx", ALL),
-        pytest.param("onnx float", ALL, marks=pytest.mark.slow),
+        *(pytest.param(kind, ALL, marks=pytest.mark.slow) for kind in ("onnx", "onnx float")),
     ],
 )
 def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(

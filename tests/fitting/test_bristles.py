@@ -42,7 +42,8 @@ def fitted(name: str) -> TorqueFits:
 
 # Of its relatives LuGre has all coefficients but one.
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x == "ElastoPlastic")) for x in TRUE]
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x in {"ElastoPlastic", "Gear"})) for x in TRUE],
 )
 def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
     found = fitted(name)
@@ -73,6 +74,7 @@ def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
     assert fitted("Dahl").intervals().loc["sigma_0 of joint1", "note"] == ""
 
 
+@pytest.mark.slow
 def test_rows_that_only_slide_are_fitted() -> None:
     time = np.arange(1000) * 0.02
     qd = np.where(time < 10.0, 1.0, -0.9) * (1.5 + 0.5 * np.sin(0.7 * time))

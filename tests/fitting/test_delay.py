@@ -48,6 +48,7 @@ def test_a_fitted_delay_is_found_with_its_interval():
     assert late.torque_delay == 0.0
 
 
+@pytest.mark.slow
 def test_scores_use_the_fitted_delay():
     train, test = delayed("one"), delayed("two", 2.0)
     settings = {"windows": (0.5, 1.5), "fit_plant": False}

@@ -279,8 +279,9 @@ def test_mistakes_in_rigs(name, rig, finding):
     assert finding in warnings_of(plant, q, tau)[0]
 
 
-def test_mistakes_in_conventions_and_time():
-    plant, q, tau = measured("driven")
+@pytest.mark.parametrize("name", ["free", pytest.param("driven", marks=pytest.mark.slow)])
+def test_mistakes_in_conventions_and_time(name):
+    plant, q, tau = measured(name)
     assert (
         "angles are relative, not absolute"
         in warnings_of(plant, q, tau, convention="absolute,upright")[0]
@@ -289,11 +290,9 @@ def test_mistakes_in_conventions_and_time():
         "angles are measured from upright, not from hanging"
         in warnings_of(plant, q, tau, convention="relative,hanging")[0]
     )
-    for name in ("free", "driven"):
-        plant, q, tau = measured(name)
-        misread = np.cumsum(q - [math.pi, 0], axis=1)
-        first = warnings_of(plant, misread, tau, convention="relative,hanging")[0]
-        assert "angles are absolute, not relative" in first
+    misread = np.cumsum(q - [math.pi, 0], axis=1)
+    first = warnings_of(plant, misread, tau, convention="relative,hanging")[0]
+    assert "angles are absolute, not relative" in first
     with pytest.warns(UserWarning, match="milliseconds"):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
@@ -350,7 +349,7 @@ def test_a_clock_that_drifts_is_named(drift):
     assert float(named) == pytest.approx(1, rel=0.05)
 
 
-@pytest.mark.parametrize("name", ["wheel", "driven"])
+@pytest.mark.parametrize("name", ["wheel", pytest.param("driven", marks=pytest.mark.slow)])
 def test_torques_held_for_a_sample_are_no_mistake(name):
     """Half a sample late throughout, as a little drift or inertia would have it."""
     plant, _, tau = measured(name)
@@ -449,7 +448,7 @@ def test_a_counter_that_overflows_is_named():
     assert "a counter overflows, after 0.7 rad each; unwrap its column" in found
 
 
-@pytest.mark.parametrize("name", ["direct", "motor"])
+@pytest.mark.parametrize("name", ["direct", pytest.param("motor", marks=pytest.mark.slow)])
 def test_torques_of_a_wrong_scale_are_named(name):
     """They fit a rig that is heavier throughout, within what is allowed; with a gear, too."""
     plant, q, tau = measured(name)
@@ -493,6 +492,7 @@ def test_a_fit_says_whether_it_is_usable():
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
 
 
+@pytest.mark.slow
 def test_noise_of_the_torque_is_no_error_of_the_law():
     plant, fine, tau = measured("wheel", COUNT / 16)
     noisy = tau + 0.05 * np.random.default_rng(0).standard_normal(tau.shape)

@@ -44,6 +44,7 @@ def driven(plant: PendulumChain, model: FrictionModel, seed: int, seconds: float
     return Recording(time, q, tau=tau, convention="relative,hanging", name=f"driven {seed}")
 
 
+@pytest.mark.slow
 def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_stamps():
     plant = geared()
     recordings = [driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), seed) for seed in (0, 1)]
@@ -90,6 +91,7 @@ def test_what_gears_lose_is_told_from_dry_friction():
     torch.testing.assert_close(found.model.schedule.values, law.schedule.values, rtol=0.02, atol=0)
 
 
+@pytest.mark.slow
 def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     """Only the truth's zeros differ; a plant with one offset for all cannot follow."""
     plant = geared()

@@ -63,6 +63,7 @@ def test_known_friction_is_recovered(convention):
     assert found.plant_terms == ()
 
 
+@pytest.mark.slow
 def test_what_a_wrong_plant_leaves_over_is_told_whether_or_not_the_rig_says_its_count():
     # A count is that of the encoder's own angle, which is not the joint's here.
     recording = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=2.0)

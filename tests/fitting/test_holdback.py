@@ -150,7 +150,11 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 
 @pytest.mark.parametrize(
     ("ratio", "told"),
-    [(1.3, "30 % worse"), (0.95, "5 % better than its constant law, with"), (np.inf, "diverges")],
+    [
+        pytest.param(1.3, "30 % worse", marks=pytest.mark.slow),
+        (0.95, "5 % better than its constant law, with"),
+        (np.inf, "diverges"),
+    ],
 )
 def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
     joint, found = constant

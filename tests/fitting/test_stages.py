@@ -124,6 +124,7 @@ def test_a_stage_bears_the_length_that_its_windows_have():
     assert [length for length, _ in found.stages] == [1.2]
 
 
+@pytest.mark.slow
 def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
     """Noise of the torque adds up over long windows, and leads their parameters astray."""
     truth = [0.35, 0.15, 0.12, 0.3, 2.0]

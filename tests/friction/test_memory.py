@@ -165,7 +165,10 @@ def test_a_constant_velocity_ends_at_the_steady_torque(law: Law) -> None:
         )
 
 
-@pytest.mark.parametrize("law", [ELASTO_PLASTIC, maxwell_slip(4)], ids=lambda law: law.name)
+@pytest.mark.parametrize(
+    "law", [pytest.param(ELASTO_PLASTIC, marks=pytest.mark.slow), maxwell_slip(4)],
+    ids=lambda law: law.name,
+)  # fmt: skip
 def test_a_load_below_breakaway_that_trembles_does_not_creep(law: Law) -> None:
     # Slowly to half the least breakaway, then sixty small swings: an elastic contact ends
     # where it began, a LuGre bristle slips a little with each swing.

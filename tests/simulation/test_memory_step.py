@@ -125,7 +125,12 @@ def test_a_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
     assert coarse / fine > 3.0
 
 
-@every_model
+# Contacts of LuGre are among the stiff ones, slips of many elements among the slow tests.
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x in {"lugre", "elasto-plastic", "slip"}))
+     for x in models()],
+)  # fmt: skip
 def test_compiled_and_eager_steps_agree(name: str) -> None:
     model = models()[name]
     # Rounding grows fast where contacts break away within a step.

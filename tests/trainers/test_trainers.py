@@ -98,7 +98,10 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.mark.parametrize(("adaptive", "made"), [(None, "NFLFM"), (ANCFM(3, [0.02]), "NFNCFM")])
+@pytest.mark.parametrize(
+    ("adaptive", "made"),
+    [(None, "NFLFM"), pytest.param(ANCFM(3, [0.02]), "NFNCFM", marks=pytest.mark.slow)],
+)
 def test_networks_are_trained_on_the_supervised_set(
     tmp_path: Path,
     cache: Path,
