@@ -13,6 +13,7 @@ from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.inputs import (
     _Choice,
+    _of_errors,
     candidates,
     chosen_inputs,
     contiguous_blocks,
@@ -156,6 +157,17 @@ def test_what_is_not_fitted_does_not_move() -> None:
     held = (torch.tensor([0.0, -9.0]).double(), torch.tensor([0.0, 9.0]).double())
     choice = _Choice([block, block], Quadratic(0.0, zero, 0 * one), held, {})
     torch.testing.assert_close(choice.left_out([]), torch.tensor([8.0, 8.0]).double())
+
+
+def test_a_block_costs_what_its_errors_do_with_the_states_at_their_best() -> None:
+    # Errors (2 x + s - 1)^2 / 2 + s^2 / 2 beside a prior 3 (x + 2)^2 / 2 of x = 0, and s = 1.
+    hessian = torch.tensor([[7.0, 2.0], [2.0, 2.0]]).double()
+    local = Quadratic(torch.tensor(6.5).double(), torch.tensor([6.0, 1.0]).double(), hessian)
+    three, six = torch.tensor([[3.0]]).double(), torch.tensor([6.0]).double()
+    found = _of_errors(local, Quadratic(6.0, six, three))
+    assert float(found.cost) == 0.25
+    torch.testing.assert_close(found.gradient, torch.tensor([-1.0]).double())
+    torch.testing.assert_close(found.hessian, torch.tensor([[2.0]]).double())
 
 
 def test_blocks_are_contiguous_and_share_out_each_recording() -> None:

@@ -273,7 +273,8 @@ class FitResult:
         )
 
     def __repr__(self) -> str:
-        return f"FitResult of {self._head()}\nWarnings: {len(self.warnings)}; see `summary()`."
+        warned = f"\nWarnings: {len(self.warnings)}; see `summary()`." if self.warnings else ""
+        return f"FitResult of {self._head()}{warned}"
 
     def summary(self) -> str:
         """Usability, status, coefficients with 95 % intervals, and warnings, as text."""

@@ -161,9 +161,9 @@ class _Choice:
                 return None
             variables = problem.variables
             shared, (precision, mean) = variables.shared_count, variables.prior()
-            pull = (precision * (x - mean))[:shared]
-            found.append(_of_errors(local, precision[:shared], pull))
-        prior = Quadratic(0.0, pull, torch.diag(precision[:shared]))
+            off, pull = (x - mean)[:shared], (precision * (x - mean))[:shared]
+            prior = Quadratic(0.5 * off @ pull, pull, torch.diag(precision[:shared]))
+            found.append(_of_errors(local, prior))
         lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         own = rows.shape[1] - len(names)
@@ -232,18 +232,18 @@ def contiguous_blocks(windows: Windows, folds: int) -> list[Tensor]:
     return blocks
 
 
-def _of_errors(local: Quadratic, precision: Tensor, pull: Tensor) -> Quadratic:
+def _of_errors(local: Quadratic, prior: Quadratic) -> Quadratic:
     """Local model over the shared variables by the errors alone, the others at their best."""
-    shared = len(precision)
+    shared = len(prior.gradient)
     H, g = local.hessian, local.gradient
     solved = torch.linalg.solve(
         H[shared:, shared:], torch.cat([H[shared:, :shared], g[shared:, None]], 1)
     )
     across = H[:shared, shared:]
     return Quadratic(
-        local.cost,
-        g[:shared] - pull - across @ solved[:, -1],
-        H[:shared, :shared] - torch.diag(precision) - across @ solved[:, :-1],
+        local.cost - prior.cost - 0.5 * g[shared:] @ solved[:, -1],
+        g[:shared] - prior.gradient - across @ solved[:, -1],
+        H[:shared, :shared] - prior.hessian - across @ solved[:, :-1],
     )
 
 

@@ -133,10 +133,10 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     end, gain = fitter.likeliest(windows, noise, vector, prior, name)
     if end is not None and not gain > options.evidence_gain:
         return by_class.kept(f"By evidence classes gain too little ({gain:.2g} nats)")
-    if end is not None:
-        # Beside the law's error as noise, the prior would outweigh what classes explain.
-        noise = min(noise, max(effective_noise(end.residuals), options.min_noise))
-        end, _ = fitter.likeliest(windows, noise, vector, prior, name)
+    # Beside the law's error as noise, the prior would outweigh what classes explain.
+    least = noise if end is None else max(effective_noise(end.residuals), options.min_noise)
+    if least < noise:
+        end, _ = fitter.likeliest(windows, least, vector, prior, name)
     if end is None:
         return by_class.kept(STOPPED, converged=False)
     found = result_from_shooting(given, end.problem, end.result, task.motions)
