@@ -1,5 +1,6 @@
 """Compare friction models: fit each to training recordings, score it on test recordings."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ from nfriction.friction import both_names, model_name
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
-from nfriction.signals import kalman_smoother
+from nfriction.signals import Motion, kalman_smoother
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,6 +32,8 @@ SCHEMA = 4
 the `limit`, the first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
+# Of a test recording's samples may be faster than any that was trained on.
+FASTER = 0.01
 # So many times the error of a model no larger cannot be the luck of a few test recordings.
 FAR_WORSE = 2.0
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
@@ -372,6 +375,7 @@ def compare(
     progress.expect(1 + len(set(map(model_name, models))), brief=True)  # scores, besides fits
     # Smoothed once for all fits.
     data = Data(train, [kalman_smoother(r.time, r.q) for r in joint])
+    _warn_of_faster(plant, data.motions, test)
     fits, failed = fit_models(
         plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
     )["fit"]
@@ -397,6 +401,27 @@ def compare(
         Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed,
     )  # fmt: skip
+
+
+def _warn_of_faster(plant: Plant, trained: Sequence[Motion], test: Sequence[Recording]) -> None:
+    """Warn of test recordings faster than all of training: friction there is extrapolated."""
+    fastest, found = np.max([np.abs(m.qd).max(0) for m in trained], axis=0), []
+    for recording in test:
+        joint = recording.joint_coordinates(plant)
+        speeds = np.abs(kalman_smoother(joint.time, joint.q).qd)
+        speeds = np.quantile(speeds, 1.0 - FASTER, axis=0)
+        place = recording.name or "a recording"
+        found += [
+            f"{name} of {place} ({speed:.3g} against {known:.3g} {plant.unit}/s)"
+            for name, speed, known in zip(plant.joint_names, speeds, fastest, strict=True)
+            if speed > known
+        ]
+    if found:
+        warnings.warn(
+            f"friction is extrapolated to speeds that no training recording reaches: "
+            f"{', '.join(found)}; train on motions as fast as those to be simulated.",
+            stacklevel=1,
+        )
 
 
 def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> None:

@@ -148,6 +148,14 @@ def test_a_test_recording_without_torque_is_named_where_those_of_training_have_i
         compare(pendulum(), "NCFM", driven, B, horizons=(0.5,), windows=(0.5,), max_steps=1)
 
 
+def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
+    settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
+    compare(pendulum(), "NCFM", A, B, **settings)
+    assert not [w for w in recwarn if "extrapolated" in str(w.message)]
+    with pytest.warns(UserWarning, match=r"joint1 of a \(8.81 against 6.08 rad/s\), joint2 of a"):
+        compare(pendulum(), "NCFM", B, A, **settings)
+
+
 def test_without_test_recordings_there_is_no_such_table(comparison):
     found = compare(pendulum(), ["NCFM"], [A], horizons=(0.5,), windows=(0.5,), max_steps=1)
     assert found.table(part="train").shape == (2, 3)
@@ -175,8 +183,8 @@ def test_every_recording_is_smoothed_once(monkeypatch):
     for user in ("evaluation.compare", "fitting.data.inputs"):
         monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
     compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
-    # No score needs the smoothed motion.
-    assert len(smoothed) == 1
+    # No score needs the smoothed motion: that of the test shows how fast it is.
+    assert len(smoothed) == 2
 
 
 def test_recordings_too_short_for_a_window_are_named(comparison):
