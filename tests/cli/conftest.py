@@ -16,8 +16,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a rig, a recording to train on and one to test on."""
     folder = tmp_path_factory.mktemp("bench")
     rigs.write(pendulum(), folder / "bench.json")
-    swing("a", 1.5).write(folder / "a.csv.gz")
-    swing("b", 2.0).write(folder / "b.csv")
+    swing("a", 2.0).write(folder / "a.csv.gz")
+    swing("b", 1.5).write(folder / "b.csv")
     return folder
 
 
