@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -69,12 +70,24 @@ class _Data:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
 
+    @cached_property
     def moving(self) -> Tensor:
         """1 where a joint turns one way during a block, else 0, (block, joint).
 
         Dry friction takes any value at rest, so the balance says nothing there.
         """
         return (self.mean(torch.sign(self.qd)).abs() == 1).to(self.qd)
+
+    @cached_property
+    def offsets(self) -> Tensor:
+        """An offset of each driven joint, (block, joint, column)."""
+        return torch.diag_embed(self.moving)[..., (self.tau != 0).any(0)]
+
+    @cached_property
+    def friction(self) -> Tensor:
+        """Dry and viscous friction of each joint, (block, joint, column)."""
+        shapes = torch.sign(self.qd), self.qd
+        return torch.cat([torch.diag_embed(self.moving * self.mean(x)) for x in shapes], -1)
 
 
 def likely_mistakes(
@@ -363,7 +376,8 @@ def _corrected_torques(
         part = torch.zeros_like(given.tau)
         part[:, joints] = given.tau[:, joints]
         # The gain is found beside the friction, as dry friction biases a ratio of torques.
-        gain = _balance(plant, replace(given, tau=given.tau - part), part)[1]
+        without = replace(given, tau=given.tau - part)
+        gain = _balance(without, without.tau - given.needed(plant), part)[1]
         if abs(gain - 1) > options.gain_term[0]:
             # Three digits: 1000 and not 1e+03.
             times = f"{float(f'{1 / gain:.3g}'):g} times too large"
@@ -411,13 +425,14 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
         return
     place = step * (torch.arange(given.block).to(given.q) - (given.block - 1) / 2)
     parabola = place.square() - place.square().mean()
-    blocks = given.needed(plant).reshape(-1, given.block, plant.joints)
+    needed = given.needed(plant)
+    blocks = needed.reshape(-1, given.block, plant.joints)
     curvature = 2 * torch.einsum("bsj,s->bj", blocks, parabola) / parabola.square().sum()
     curvature = curvature.repeat_interleave(given.block, 0)
     for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
         part = torch.zeros_like(given.tau)
         part[:, j] = curvature[:, j]
-        ratio = -_balance(plant, given, part)[1]
+        ratio = -_balance(given, given.tau - needed, part)[1]
         if ratio > 0:
             text = (
                 f"{plant.joint_names[j]} is elastic or has play between drive and encoder "
@@ -529,7 +544,7 @@ def _of_sliding(
     of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
     # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
     apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
-    return data.mean(friction), data.mean(of_rig), apart & (data.moving()[:, j] > 0)
+    return data.mean(friction), data.mean(of_rig), apart & (data.moving[:, j] > 0)
 
 
 def _growth(
@@ -608,8 +623,8 @@ def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
     """Factor of a change of buffers, in which torques are linear, that fits best."""
     own = dict(plant.named_buffers())
     moved = plant.replace(**{name: own[name] + part for name, part in change.items()})
-    column = given.needed(plant) - given.needed(moved)
-    return _balance(plant, given, column)[1]
+    needed = given.needed(plant)
+    return _balance(given, given.tau - needed, needed - given.needed(moved))[1]
 
 
 def _unexplained(plant: Plant, data: _Data) -> float:
@@ -618,34 +633,29 @@ def _unexplained(plant: Plant, data: _Data) -> float:
     Root mean square over joints; the torque of a joint is the sum of squares of the drive's, of
     gravity's and of inertia's.
     """
-    target = _balance(plant, data)[0]
-    rest = torch.zeros_like(data.q)
+    needed, rest = data.needed(plant), torch.zeros_like(data.q)
+    target = _balance(data, data.tau - needed)[0]
     static = plant.inverse_dynamics(data.q, rest, rest)
-    parts = data.tau, static, data.needed(plant) - static
-    moving = data.moving()
-    size = torch.stack([(moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
+    parts = data.tau, static, needed - static
+    size = torch.stack([(data.moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
     return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
 
 
-def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Tensor, float]:
-    """Mean square of the unexplained torque, (joint,), and the factor of an `extra` torque."""
+def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, float]:
+    """Mean square of what friction leaves of a torque, (joint,), and the factor of an `extra` one.
+
+    Torques are (sample, joint).
+    """
     from scipy.optimize import nnls  # slow to import
 
-    torque = data.tau - data.needed(plant)
-    moving = data.moving()
-    left = moving * data.mean(torque)
+    left = data.moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
-    # Friction that adds energy is excluded; a drive may have an offset.
-    signed, free = [], [] if extra is None else [-moving * data.mean(extra)]
-    own = torch.eye(plant.joints, dtype=left.dtype)
-    for j in range(plant.joints):
-        shapes = torch.sign(data.qd[:, j]), data.qd[:, j]
-        signed += [own[j] * (moving[:, j] * data.mean(shape))[:, None] for shape in shapes]
-        if data.tau[:, j].any():
-            free.append(own[j] * moving)
-    # A factor of either sign is the difference of two that are positive.
-    design = torch.stack([*free, *signed, *(-column for column in free)], -1)
+    own = [] if extra is None else [-(data.moving * data.mean(extra))[..., None]]
+    free = torch.cat([*own, data.offsets], -1)
+    # Friction that adds energy is excluded. A factor of either sign is the difference of two that
+    # are positive.
+    design = torch.cat([free, data.friction, -free], -1)
     scaled = (design / weight[:, None]).reshape(-1, design.shape[-1]).numpy()
     norm = np.linalg.norm(scaled, axis=0)
     norm[norm == 0] = 1.0
@@ -656,5 +666,5 @@ def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Te
     _, factor = np.linalg.qr(rows)
     found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
     residual = left - design @ torch.as_tensor(found)
-    factor_of_extra = found[0] - found[len(free) + len(signed)] if free else 0.0
+    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
     return residual.square().mean(0), float(factor_of_extra)

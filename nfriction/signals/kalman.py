@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,6 +64,8 @@ ORDER = 4
 # Time constants after which a state carries no information on the next: a longer gap between
 # samples counts as this long, for its own powers would leave nothing but rounding.
 FARTHEST = 1000.0
+# Times the step; the likelihood of each is tried.
+BANDWIDTHS = np.geomspace(2e-3, 2.0, 19)
 _FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)])
 
 
@@ -120,9 +123,8 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     the driving noise in those units.
     """
     transition, diffusion = _model(delta, process)
-    spans = np.concatenate([np.zeros((1, delta.shape[1])), np.cumsum(delta, axis=0)])
     series = y[..., None]
-    mean, covariance = _initial(spans, series)
+    mean, covariance = _initial(_spans(delta), series)
     predicted, filtered, settled = _covariances(transition, diffusion, covariance)
     means = _filter(transition, predicted, mean, series)
     # Smoother gain C = P F^T (F P F^T + Q)^-1, from its transpose as the predictions are symmetric.
@@ -158,52 +160,72 @@ def _most_likely(
     # Stretches of 1000 samples determine two noise parameters well; more only cost time.
     length = min(len(q), 1000)
     first = np.linspace(0, len(q) - length, min(8, len(q) // length)).astype(int)
-    grid = np.geomspace(2e-3, 2.0, 19)  # bandwidth · step
     stretches = first + np.arange(length)[:, None]
-    delta = steps[stretches[:-1], None] / step * grid
+    delta = steps[stretches[:-1], None] / step * BANDWIDTHS
     y = q[stretches]
-    if np.all(delta == delta[:1, :1]):
+    if np.all(delta == BANDWIDTHS):
         # Equal steps: all stretches share their covariances.
         delta, y = delta[:, :1], y.reshape(length, 1, -1)
-    misfit, volume = _innovations(delta, y)
-    misfit = misfit.reshape(len(grid), -1, q.shape[1]).sum(axis=1)
+        predicted = _equally_spaced(length)
+    else:
+        predicted = _predicted(delta)
+    misfit, volume = _innovations(delta, predicted, y)
+    misfit = misfit.reshape(len(BANDWIDTHS), -1, q.shape[1]).sum(axis=1)
     volume = volume * (len(first) / delta.shape[1])
     count = (length - 1) * len(first)
     floor = _resolution(q) ** 2 / 12
     if sigma is not None:
         variance = np.broadcast_to(sigma**2, misfit.shape)
     elif density is not None:
-        variance = density * step ** (2 * ORDER - 1) / grid[:, None] ** (2 * ORDER)
+        variance = density * step ** (2 * ORDER - 1) / BANDWIDTHS[:, None] ** (2 * ORDER)
         variance = np.maximum(variance, floor)
     else:
         variance = np.maximum(misfit / count, floor)
     cost = count * np.log(variance) + volume[:, None] + misfit / variance
     best = _lowest(cost)
-    rows = np.arange(len(grid))
-    bandwidth = np.exp(np.interp(best, rows, np.log(grid))) / step
+    rows = np.arange(len(BANDWIDTHS))
+    bandwidth = np.exp(np.interp(best, rows, np.log(BANDWIDTHS))) / step
     log_variance = [
         np.interp(row, rows, column) for row, column in zip(best, np.log(variance).T, strict=True)
     ]
     return np.exp(0.5 * np.array(log_variance)), bandwidth
 
 
-def _innovations(delta: Array, y: Array) -> tuple[Array, Array]:
+@lru_cache(maxsize=4)
+def _equally_spaced(samples: int) -> Array:
+    """Predicted covariances (time, 1, grid, order, order) of a record with equal steps."""
+    found = _predicted(np.broadcast_to(BANDWIDTHS, (samples - 1, 1, len(BANDWIDTHS))))
+    found.setflags(write=False)
+    return found
+
+
+def _predicted(delta: Array) -> Array:
+    """Predicted covariances of steps (time - 1, stretch, grid)."""
+    transition, diffusion = _model(delta, np.median(delta, axis=(0, 1)))
+    _, first = _initial(_spans(delta), np.zeros((len(delta) + 1, *delta.shape[1:], 1)))
+    return _covariances(transition, diffusion, first)[0]
+
+
+def _innovations(delta: Array, predicted: Array, y: Array) -> tuple[Array, Array]:
     """Squared innovations over their variance (grid, joint), and the variances' logarithms (grid,).
 
     Steps are (time - 1, stretch, grid), positions `y` (time, stretch, joint) in units of their
     noise up to a factor.
     """
-    transition, diffusion = _model(delta, np.median(delta, axis=(0, 1)))
-    spans = np.concatenate([np.zeros((1, *delta.shape[1:])), np.cumsum(delta, axis=0)])
+    transition, _ = _model(delta, np.median(delta, axis=(0, 1)))
     series = np.broadcast_to(y[:, :, None], (*y.shape[:2], delta.shape[2], y.shape[2]))
-    mean, covariance = _initial(spans, series)
-    predicted, _, _ = _covariances(transition, diffusion, covariance)
+    mean, _ = _initial(_spans(delta), series)
     means = _filter(transition, predicted, mean, series)
     ahead = (transition[..., :1, :] @ means[:-1])[..., 0, :]
     # At least the noise's own, whatever rounding leaves of the prediction's behind a gap.
     variance = np.maximum(predicted[1:, ..., 0, 0], 0.0) + 1
     misfit = ((series[1:] - ahead) ** 2 / variance[..., None]).sum(axis=(0, 1))
     return misfit, np.log(variance).sum(axis=(0, 1))
+
+
+def _spans(delta: Array) -> Array:
+    """Times since the first sample by the steps between samples."""
+    return np.concatenate([np.zeros((1, *delta.shape[1:])), np.cumsum(delta, axis=0)])
 
 
 def _lowest(cost: Array) -> Array:

@@ -129,6 +129,9 @@ def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
     tied = tables.order(workspace(tmp_path, nine | {f"A{law}": 1.0}))
     assert tied.holds
     assert set(tied.best.values()) == {f"A{law} = NF{law}"}
+    rounded = tables.order(workspace(tmp_path, nine | {f"A{law}": 1.0 - 1e-12}))
+    assert rounded.holds
+    assert rounded.best == tied.best
     worse = tables.order(workspace(tmp_path, nine | {f"A{law}": 4.0}))
     assert len(worse.broken) == 3  # on every joint
     assert all(f"A{law}" in text for text in worse.broken)
