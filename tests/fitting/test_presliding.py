@@ -148,7 +148,6 @@ def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
     assert f_v == pytest.approx(0.4, abs=0.1)
 
 
-@pytest.mark.slow
 def test_presliding_and_sliding_give_all_coefficients(short) -> None:
     _, found = short
     assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.03)
