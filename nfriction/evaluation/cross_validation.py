@@ -190,18 +190,15 @@ def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]
         )
     joint = recording.joint_coordinates(plant)
     motion = kalman_smoother(joint.time, joint.q)
-    index = np.arange(len(recording))
+    series, index = (motion.time, motion.q, motion.qd, motion.qdd), np.arange(len(recording))
     folds = []
     for first, last in pairwise(np.linspace(0, index[-1], count + 1).astype(int)):
         inside = (first <= index) & (index <= last)
         # A block at an end of the recording leaves no lone sample behind.
         rest = ((index <= first) & (first > 0)) | ((last <= index) & (last < index[-1]))
-        folds.append(Fold(*(TimeBlock(recording[m], _part(motion, m)) for m in (inside, rest))))
+        parts = ((recording[m], [x[m] for x in series]) for m in (inside, rest))
+        folds.append(Fold(*(TimeBlock(of, Motion(*smoothed)) for of, smoothed in parts)))
     return folds
-
-
-def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
-    return Motion(motion.time[mask], motion.q[mask], motion.qd[mask], motion.qdd[mask])
 
 
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:

@@ -234,7 +234,8 @@ class Simulator:
             drawn, _ = self.simulate(state + off, samples, noise=k)
             apart = (self._as_read(drawn - zero[:, :, None], measured) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
-        squares += self._noise_beyond_rounding(starts)
+        # Noise of the measured position beside its rounding.
+        squares += np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
         if self.draws and np.isfinite(squares).all():
             finer, _ = self.simulate(state, samples, finer=2)
             squares += np.mean((finer - q)[:, scored] ** 2, axis=(0, 1))
@@ -247,10 +248,6 @@ class Simulator:
         """Positions as the encoder reads them, its counts in line with the measured ones."""
         unit = np.where(self.quantum > 0, self.quantum, 1.0)
         return np.where(self.quantum > 0, measured + unit * np.rint((q - measured) / unit), q)
-
-    def _noise_beyond_rounding(self, starts: Starts) -> Array:
-        """Variance of a measured position beside the rounding error, (joint,)."""
-        return np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
 
     def simulate(
         self,

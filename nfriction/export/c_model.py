@@ -65,7 +65,8 @@ def source_of(
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
         "loaded": controller.loaded,
-        "load": plant is not None and _reads_load(controller.model),
+        "load": plant is not None
+        and any(_depends(x, "load") for x in _traced_law(controller.model, 1).outputs[0].nodes),
         "bits": description["status_bits"],
         # Names and units are foreign text.
         "about": description,
@@ -306,10 +307,6 @@ def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
 
 def _depends(node: Node, name: str) -> bool:
     return any(n.op == "input" and n.value[0] == name for n in reachable([node]))
-
-
-def _reads_load(model: FrictionModel) -> bool:
-    return any(_depends(node, "load") for node in _traced_law(model, 1).outputs[0].nodes)
 
 
 def _traced_law(model: FrictionModel, joints: int) -> Program:

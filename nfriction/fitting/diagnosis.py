@@ -79,11 +79,6 @@ class _Data:
         return (self.mean(torch.sign(self.qd)).abs() == 1).to(self.qd)
 
     @cached_property
-    def offsets(self) -> Tensor:
-        """An offset of each driven joint, (block, joint, column)."""
-        return torch.diag_embed(self.moving)[..., (self.tau != 0).any(0)]
-
-    @cached_property
     def friction(self) -> Tensor:
         """Dry and viscous friction of each joint, (block, joint, column)."""
         shapes = torch.sign(self.qd), self.qd
@@ -642,17 +637,16 @@ def _unexplained(plant: Plant, data: _Data) -> float:
 
 
 def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, float]:
-    """Mean square of what friction leaves of a torque, (joint,), and the factor of an `extra` one.
-
-    Torques are (sample, joint).
-    """
+    """Mean square of torque that friction leaves, (joint,), and the factor of an `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
     left = data.moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
     own = [] if extra is None else [-(data.moving * data.mean(extra))[..., None]]
-    free = torch.cat([*own, data.offsets], -1)
+    # A drive may have an offset.
+    offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]
+    free = torch.cat([*own, offsets], -1)
     # Friction that adds energy is excluded. A factor of either sign is the difference of two that
     # are positive.
     design = torch.cat([free, data.friction, -free], -1)

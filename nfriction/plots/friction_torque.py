@@ -81,7 +81,8 @@ def torque_over_velocity(
         for name, line in lines.items():
             ax.plot(grid, factor * line, **looks[name].line)
             if name in known:
-                sd = _torque_sd(known[name], models[name], grid, k)
+                at = torch.as_tensor(grid)[:, None].expand(-1, plant.joints).contiguous()
+                sd = known[name].torque_sd(models[name], at)[:, k].numpy()
                 _band(ax, grid, factor * line, factor * sd, looks[name].line["color"])
         ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
         _name_axes(ax, plant.joint_names[k], plant.unit, unit)
@@ -150,12 +151,6 @@ def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
         held = model.coefficients(velocity, torch.zeros_like(velocity))
         torque = model.steady_torque(velocity, load_at_rest(model.law, velocity), held)
     return torque[:, joint].numpy()
-
-
-def _torque_sd(known: CoefficientUncertainty, model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Standard deviation of one joint's torque over its velocity."""
-    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints).contiguous()
-    return known.torque_sd(model, velocity)[:, joint].numpy()
 
 
 def friction_curves(fits: "TorqueFits") -> Figure:

@@ -114,7 +114,9 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         (speeds, speed_widths), (accelerations, widths) = (
             (c[j].tolist(), w[j].tolist()) for c, w in zip(fuzzy.centres, fuzzy.widths, strict=True)
         )
-        names_v = _in_order(speeds, _speed_names(len(speeds)))
+        # Language has no words for more than five.
+        numbered = [f"speed {k + 1}" for k in range(len(speeds))]
+        names_v = _in_order(speeds, _SPEEDS.get(len(speeds), numbered))
         names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
         v = tuple(map(Term, names_v, speeds, speed_widths))
         a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
@@ -124,11 +126,6 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
         described.append(JointRules(joint, v, a, tuple(rules)))
     return described
-
-
-def _speed_names(count: int) -> Sequence[str]:
-    # Language has no words for more than five.
-    return _SPEEDS.get(count) or [f"speed {k + 1}" for k in range(count)]
 
 
 def _acceleration_names(ordered: Sequence[float], along_motion: bool) -> list[str]:

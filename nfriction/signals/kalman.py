@@ -123,8 +123,9 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     the driving noise in those units.
     """
     transition, diffusion = _model(delta, process)
+    spans = np.concatenate([np.zeros((1, delta.shape[1])), np.cumsum(delta, axis=0)])
     series = y[..., None]
-    mean, covariance = _initial(_spans(delta), series)
+    mean, covariance = _initial(spans, series)
     predicted, filtered, settled = _covariances(transition, diffusion, covariance)
     means = _filter(transition, predicted, mean, series)
     # Smoother gain C = P F^T (F P F^T + Q)^-1, from its transpose as the predictions are symmetric.
@@ -166,10 +167,7 @@ def _most_likely(
     if np.all(delta == BANDWIDTHS):
         # Equal steps: all stretches share their covariances.
         delta, y = delta[:, :1], y.reshape(length, 1, -1)
-        predicted = _equally_spaced(length)
-    else:
-        predicted = _predicted(delta)
-    misfit, volume = _innovations(delta, predicted, y)
+    misfit, volume = _innovations(delta, y)
     misfit = misfit.reshape(len(BANDWIDTHS), -1, q.shape[1]).sum(axis=1)
     volume = volume * (len(first) / delta.shape[1])
     count = (length - 1) * len(first)
@@ -191,30 +189,20 @@ def _most_likely(
     return np.exp(0.5 * np.array(log_variance)), bandwidth
 
 
-@lru_cache(maxsize=4)
-def _equally_spaced(samples: int) -> Array:
-    """Predicted covariances (time, 1, grid, order, order) of a record with equal steps."""
-    found = _predicted(np.broadcast_to(BANDWIDTHS, (samples - 1, 1, len(BANDWIDTHS))))
-    found.setflags(write=False)
-    return found
-
-
-def _predicted(delta: Array) -> Array:
-    """Predicted covariances of steps (time - 1, stretch, grid)."""
-    transition, diffusion = _model(delta, np.median(delta, axis=(0, 1)))
-    _, first = _initial(_spans(delta), np.zeros((len(delta) + 1, *delta.shape[1:], 1)))
-    return _covariances(transition, diffusion, first)[0]
-
-
-def _innovations(delta: Array, predicted: Array, y: Array) -> tuple[Array, Array]:
+def _innovations(delta: Array, y: Array) -> tuple[Array, Array]:
     """Squared innovations over their variance (grid, joint), and the variances' logarithms (grid,).
 
     Steps are (time - 1, stretch, grid), positions `y` (time, stretch, joint) in units of their
     noise up to a factor.
     """
-    transition, _ = _model(delta, np.median(delta, axis=(0, 1)))
+    transition, diffusion = _model(delta, np.median(delta, axis=(0, 1)))
+    spans = np.concatenate([np.zeros((1, *delta.shape[1:])), np.cumsum(delta, axis=0)])
     series = np.broadcast_to(y[:, :, None], (*y.shape[:2], delta.shape[2], y.shape[2]))
-    mean, _ = _initial(_spans(delta), series)
+    mean, covariance = _initial(spans, series)
+    if np.all(delta == BANDWIDTHS):
+        predicted = _of_equal_steps(len(y))
+    else:
+        predicted = _covariances(transition, diffusion, covariance)[0]
     means = _filter(transition, predicted, mean, series)
     ahead = (transition[..., :1, :] @ means[:-1])[..., 0, :]
     # At least the noise's own, whatever rounding leaves of the prediction's behind a gap.
@@ -223,9 +211,13 @@ def _innovations(delta: Array, predicted: Array, y: Array) -> tuple[Array, Array
     return misfit, np.log(variance).sum(axis=(0, 1))
 
 
-def _spans(delta: Array) -> Array:
-    """Times since the first sample by the steps between samples."""
-    return np.concatenate([np.zeros((1, *delta.shape[1:])), np.cumsum(delta, axis=0)])
+@lru_cache(maxsize=4)
+def _of_equal_steps(samples: int) -> Array:
+    """Predicted covariances (time, 1, grid, order, order) of all records with equal steps."""
+    delta = np.broadcast_to(BANDWIDTHS, (samples - 1, 1, len(BANDWIDTHS)))
+    spans = np.cumsum(np.concatenate([np.zeros_like(delta[:1]), delta]), axis=0)
+    _, first = _initial(spans, np.zeros((*spans.shape, 1)))
+    return _covariances(*_model(delta, BANDWIDTHS), first)[0]
 
 
 def _lowest(cost: Array) -> Array:

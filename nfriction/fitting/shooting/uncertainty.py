@@ -80,13 +80,9 @@ def measurement_noise(
         return least
     errors = problem.errors(x)
     encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
-    return math.hypot(encoder, _by_torque(problem, x))
-
-
-def _by_torque(problem: ShootingProblem, x: Tensor) -> float:
-    """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
     response = torque_response(problem, x, 1)
-    return 0.0 if response is None else _once_fitted(problem, x, response[..., 0])
+    by_torque = 0.0 if response is None else _once_fitted(problem, x, response[..., 0])
+    return math.hypot(encoder, by_torque)
 
 
 def _once_fitted(problem: ShootingProblem, x: Tensor, response: Tensor) -> float:
