@@ -30,6 +30,8 @@ from nfriction.friction.memory import (
     ElastoPlastic,
     LuGre,
     MaxwellSlip,
+    NFDahl,
+    NFElastoPlastic,
     NFLuGre,
     steady_friction,
 )
@@ -72,12 +74,17 @@ def models() -> dict[str, FrictionModel]:
             2, [1.0, 0.5, 0.3, 0.2, 0.1, 1e-3, 5e-3, 0.02, 0.05, 0.1, 3e-3, 0.3, 0.1]
         ),
     }
-    network = NFLuGre(2, SOFT, terms=(3, 2))
-    network.schedule.set_range(10.0, [-100.0, 100.0])
-    lower, upper = network.schedule.bounds()
-    noise = torch.randn(lower.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
-    network.schedule.set_parameter_vector(torch.where(lower < upper, 0.3 * noise, 0.0))
-    found["neuro-fuzzy"] = network
+    networks = {
+        "neuro-fuzzy": NFLuGre(2, SOFT, terms=(3, 2)),
+        "neuro-fuzzy dahl": NFDahl(2, [0.03, 0.003, 3.0], terms=(3, 2)),
+        "neuro-fuzzy elasto-plastic": NFElastoPlastic(2, [*SOFT, 0.5], terms=(3, 2)),
+    }
+    for network in networks.values():
+        network.schedule.set_range(10.0, [-100.0, 100.0])
+        lower, upper = network.schedule.bounds()
+        noise = torch.randn(lower.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
+        network.schedule.set_parameter_vector(torch.where(lower < upper, 0.3 * noise, 0.0))
+    found |= networks
     return {name: model.requires_grad_(False) for name, model in found.items()}
 
 

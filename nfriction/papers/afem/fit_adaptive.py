@@ -131,14 +131,14 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     noise, name = effective_noise(constant.residuals), f"{length:g} s windows, by class"
     prior = by_class.table.prior()
     end, gain = fitter.likeliest(windows, noise, vector, prior, name)
-    if end is not None and not gain > options.evidence_gain:
-        return by_class.kept(f"By evidence classes gain too little ({gain:.2g} nats)")
-    # Beside the law's error as noise, the prior would outweigh what classes explain.
-    least = noise if end is None else max(effective_noise(end.residuals), options.min_noise)
-    if least < noise:
-        end, _ = fitter.likeliest(windows, least, vector, prior, name)
     if end is None:
         return by_class.kept(STOPPED, converged=False)
+    if not gain > options.evidence_gain:
+        return by_class.kept(f"By evidence classes gain too little ({gain:.2g} nats)")
+    # Beside the law's error as noise, the prior would outweigh what classes explain.
+    least = max(effective_noise(end.residuals), options.min_noise)
+    if least < noise:
+        end = fitter.likeliest(windows, least, vector, prior, name)[0] or end.as_stopped()
     found = result_from_shooting(given, end.problem, end.result, task.motions)
     q0, qd0 = end.parts.states.chunk(2, -1)
     return by_class.backtracked(found, replace(windows, q0=q0, qd0=qd0), constant.residual)

@@ -15,7 +15,12 @@ from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.papers.afem.classes import ClassOptions
-from nfriction.papers.afem.fit_adaptive import GivenClasses, GivenClassesProblem, fit_adaptive
+from nfriction.papers.afem.fit_adaptive import (
+    ClassFitter,
+    GivenClasses,
+    GivenClassesProblem,
+    fit_adaptive,
+)
 from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
@@ -127,6 +132,22 @@ def test_a_fit_that_is_stopped_keeps_the_constant_law(case):
                          callback=lambda name, step: True)  # fmt: skip
     assert not found.converged
     assert "Stopped before the classes were found" in found.status
+
+
+def test_a_stop_after_evidence_accepted_the_classes_keeps_them(case, monkeypatch):
+    searches, original = [], ClassFitter.likeliest
+
+    def likeliest(self, *about):
+        searches.append(about)
+        return original(self, *about) if len(searches) == 1 else (None, 0.0)
+
+    monkeypatch.setattr(ClassFitter, "likeliest", likeliest)
+    found = fitted(case, classes=ClassOptions(THRESHOLDS, prior_sd=3.0))
+    assert len(searches) == 2
+    assert "constant law is kept" not in found.status
+    assert not found.converged
+    assert "stop" in found.status.lower()
+    assert found.residual < 0.5 * case[-1].residual
 
 
 @pytest.mark.parametrize(("of_class", "kept"), [(3.0, False), (-math.inf, True)])
