@@ -189,7 +189,7 @@ def _print(
     names = (*comparison.fits, *comparison.failed)
     print(f"models: {', '.join(f'{name}: {plain_name(name)}' for name in names)}\n")
     for name, fit in comparison.fits.items():
-        print(tables.fit_lines(name, fit))
+        print(tables.fit_lines(name, fit, comparison.unfit().get(name, "")))
     for name, why in comparison.failed.items():
         print(f"{name}: not fitted: {why}")
     if selection is not None:

@@ -42,9 +42,9 @@ def error_tables(comparison: Comparison) -> str:
     return "\n\n".join([*parts, LEGEND])
 
 
-def fit_lines(name: str, fit: FitResult) -> str:
-    """Usability, status and warnings of a fit."""
-    verdict, reason = fit.usability
+def fit_lines(name: str, fit: FitResult, unfit: str = "") -> str:
+    """Usability, status and warnings of a fit; `unfit` is why its test forbids to use it."""
+    verdict, reason = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     head = f"{verdict} ({reason})" if reason else verdict
     lines = [f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings]

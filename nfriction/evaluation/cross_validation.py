@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
@@ -275,11 +274,6 @@ def _indistinguishable(one: Candidate, best: Candidate) -> bool:
         return True
     squares = np.square([one.errors, best.errors])
     logarithms = np.log(squares.clip(min=DEFAULTS.min_noise**2))
-    return all(_within_error(a - b) for a, b in (squares, logarithms))
-
-
-def _within_error(difference: NDArray[np.float64]) -> bool:
-    """True where a mean is no larger than its standard error."""
-    n = len(difference)
-    error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
-    return float(difference.mean()) <= error
+    differences, n = (np.subtract(*squares), np.subtract(*logarithms)), len(one.errors)
+    # A mean is within its standard error.
+    return all(d.mean() <= (d.std(ddof=1) / math.sqrt(n) if n > 1 else 0.0) for d in differences)

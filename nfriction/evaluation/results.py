@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -140,7 +139,10 @@ def write_results(
         "selection": None if selection is None else selection.to_dict(),
         "recordings": {"train": digests(train), "test": digests(test)},
     }
-    run = _run_id(results, comparison)
+    # Runs that come to the same results and parameters have the same files.
+    parameters = {n: parameter_hash(f.model.state_dict()) for n, f in comparison.fits.items()}
+    content = json.dumps([results, parameters], sort_keys=True)
+    run = hashlib.sha256(content.encode()).hexdigest()[:16]
     results |= {"run": run, "command": command}
     unfinished = folder / UNFINISHED
 
@@ -224,13 +226,6 @@ def _put_in_place(folder: Path) -> None:
                 path.replace(place)
         (complete / RESULTS).replace(index)
     shutil.rmtree(complete, ignore_errors=True)
-
-
-def _run_id(results: dict[str, Any], comparison: Comparison) -> str:
-    """Digest of results and parameters: runs that come to the same have the same files."""
-    parameters = {n: parameter_hash(f.model.state_dict()) for n, f in comparison.fits.items()}
-    content = json.dumps([results, parameters], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 def _table(comparison: Comparison, run: str) -> str:

@@ -489,13 +489,16 @@ def loose_loads(
     # Every block, since a reversal lies between neighbours.
     every = replace(options, diagnosis_samples=sum(map(len, recordings)))
     data = _collect(recordings, motions, every)
-    driven = np.flatnonzero(data.tau.abs().amax(0)).tolist()
+    driven = np.flatnonzero(data.tau.any(0)).tolist()
+    geared = [k for k in driven if "armature" in own and own["armature"][k] > 0]
+    if not geared or len(data.q) < 2 * pieces * data.block:
+        return
     terms = [x.change for x in plant_parameters(plant, driven=driven, options=options) if x.ratio]
     rigs = [plant.replace(**{k: own[k] + x for k, x in change.items()}) for change in terms]
     needed, wrong = data.needed(plant), [data.needed(rig) for rig in rigs]
     elapsed = data.mean(data.time)[:, 0].diff()
     beside = (elapsed > 0) & (elapsed < 1.5 * elapsed.median())
-    for j in (k for k in driven if "armature" in own and own["armature"][k] > 0):
+    for j in geared:
         friction, of_rig, sliding = _of_sliding(plant, data, j, options)
         load = needed[:, j] - own["armature"][j] * data.qdd[:, j]
         more = [torch.sign(data.qd[:, j]) * load.abs(), data.qdd[:, j], *(x[:, j] for x in wrong)]

@@ -425,10 +425,10 @@ def _figures(
         yield "torque_over_velocity", figure
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
     for law in dict.fromkeys(model.law.name for model in models.values()):
-        of_law = {name: model for name, model in models.items() if model.law.name == law}
         # Constants along the motion are worth a figure beside coefficients that follow it.
-        if any(_follows_motion(model) for model in of_law.values()):
-            yield f"over_time_{law}", coefficients_over_time(of_law, last.motions[0], **labels)
+        if any(_follows_motion(m) for m in models.values() if m.law.name == law):
+            figure = coefficients_over_time(models, last.motions[0], law=law, **labels)
+            yield f"over_time_{law}", figure
     for name, found in comparison.fits.items():
         if found.model.schedule.fuzzy_rules() is not None and _follows_motion(found.model):
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}

@@ -149,29 +149,31 @@ def coefficients_over_time(
     models: Mapping[str, FrictionModel],
     motion: Motion,
     *,
+    law: str | None = None,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
 ) -> Figure:
     """Coefficients of models of one law along a motion, a panel a coefficient and joint.
 
     Args:
-        models: by name, all of one law and of as many joints; constant, adaptive or neuro-fuzzy.
+        models: by name, all of as many joints; constant, adaptive or neuro-fuzzy.
         motion: in joint coordinates.
+        law: name of the law whose models are drawn, each in its colour among all; else all are.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
 
     Raises:
         ValueError: if there is no model, or their coefficients differ.
     """
-    laws = {model.law.name for model in models.values()}
-    if len(laws) != 1:
+    looks = style.looks(models)
+    models = {name: m for name, m in models.items() if law in (None, m.law.name)}
+    if len(laws := {model.law.name for model in models.values()}) != 1:
         raise ValueError(f"`models` must be one or several of one law, got {sorted(laws)}.")
     first = next(iter(models.values()))
     names = style.joint_labels(joint_names, first.joints)
     along = [_along(model, motion) for model in models.values()]
     rows = len(first.law.coefficients)
     figure, axes = style.panels(rows, first.joints, style.PAGE, 0.4 + 1.25 * rows, sharex=True)
-    looks = style.looks(models)
     for k, coefficient in enumerate(first.law.coefficients):
         for j, ax in enumerate(axes[k]):
             values = np.stack([found[:, j, k] for found in along])

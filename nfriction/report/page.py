@@ -307,7 +307,8 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     ]
     if intervals:
         tables.append(interval_table(name, intervals, bool(fit.plant)))
-    verdict, why = fit.usability
+    unfit = run.unfit.get(name)
+    verdict, why = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
     return {
         "name": name,
         "record": fit,

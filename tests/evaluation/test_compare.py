@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nfriction import LFM, NFLFM, compare
-from nfriction.cli.tables import error_tables, verdict
+from nfriction.cli.tables import error_tables, fit_lines, verdict
 from nfriction.evaluation.compare import Comparison, coefficient_summary
 from nfriction.evaluation.parallel import Progress
 from nfriction.evaluation.score import RMSE, Errors, Score
@@ -152,8 +152,19 @@ def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
     compare(pendulum(), "NCFM", A, B, **settings)
     assert not [w for w in recwarn if "extrapolated" in str(w.message)]
-    with pytest.warns(UserWarning, match=r"joint1 of a \(8.81 against 6.08 rad/s\), joint2 of a"):
+    with pytest.warns(UserWarning, match=r"joint1 of a \(8.79 against 6.08 rad/s\), joint2 of a"):
         compare(pendulum(), "NCFM", B, A, **settings)
+
+
+def test_noise_at_rest_is_no_faster_motion(recwarn):
+    rng = np.random.default_rng(0)
+    still = [
+        dataclasses.replace(x, q=x.q[:1] + size * rng.normal(size=x.q.shape))
+        for x, size in ((A, 1e-5), (B, 2e-5))
+    ]
+    settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
+    compare(pendulum(), "NCFM", *still, **settings)
+    assert not [w for w in recwarn if "extrapolated" in str(w.message)]
 
 
 def test_without_test_recordings_there_is_no_such_table(comparison):
@@ -274,6 +285,8 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison):
     runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
     assert set(runaway.unfit()) == {"LFM"}
     assert "not fit for use: LFM: NCFM with no more parameters has" in verdict(runaway)
+    line = fit_lines("LFM", runaway.fits["LFM"], runaway.unfit()["LFM"])
+    assert line.startswith("LFM: do not use (in the test, NCFM with no more parameters has")
     assert runaway.to_dict()["unfit"] == runaway.unfit()
     assert "it diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
     worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()

@@ -23,6 +23,7 @@ from nfriction import (
     fit,
     rollout,
 )
+from nfriction.fitting.diagnosis import loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
@@ -144,6 +145,16 @@ def test_play_in_a_gear_is_named(play, named):
     said = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
     shares = [re.search(r"joint1 is loose after it reverses: (\d+) % ", w) for w in said]
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
+
+
+@pytest.mark.parametrize("samples", [50, 130, 200])
+def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
+    q, tau = geared(math.radians(1.0))
+    short = Recording(
+        STEP * np.arange(samples), q[:samples], tau[:samples], convention="relative,upright"
+    )
+    plant, motions = PendulumChain(**MOTOR), [kalman_smoother(short.time, short.q)]
+    assert list(loose_loads(plant, [short], motions, FitOptions())) == []
 
 
 @pytest.mark.parametrize("change", [0.3, -0.3])

@@ -33,6 +33,14 @@ def test_lines_are_the_coefficients_along_the_motion(motion):
     figure.draw_without_rendering()
 
 
+def test_models_of_one_law_keep_their_colours_among_all(motion):
+    models = {"NCFM": NCFM(2), "LFM": LFM(2), "NFLFM": NFLFM(2)}
+    figure = plots.coefficients_over_time(models, motion, law=models["LFM"].law.name)
+    looks = plots.style.looks(models)
+    expected = [looks[name].line["color"] for name in ("LFM", "NFLFM")]
+    assert [line.get_color() for line in figure.axes[0].lines] == expected
+
+
 def test_an_adaptive_model_switches_as_a_controller_does(motion):
     values = [[1e-3, 1e-2], [2e-3, 2e-2], [3e-3, 3e-2]]
     model = ALFM(2, [values, values])

@@ -369,12 +369,6 @@ class ClassFit:
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property
-    def substeps(self) -> int:
-        """Integration steps per sample."""
-        longest = max(r.longest_step for r in self.task.recordings)
-        return integration_substeps(self.task.plant, self.given, longest)
-
-    @property
     def driving(self) -> tuple[Tensor, ...]:
         """Class that drives each sample of a recording, one with too few data as its neighbour."""
         stands_for = self.classes.stands_for
@@ -395,9 +389,9 @@ class ClassFit:
             schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in task.motions
         ]
         memory = torch.stack([along[place][first] for place, first, _ in windows.spans])
-        error = PositionError(
-            found.plant, model, windows, task.measurement, self.substeps, memory=memory
-        )
+        longest = max(r.longest_step for r in task.recordings)
+        steps = integration_substeps(task.plant, self.given, longest)
+        error = PositionError(found.plant, model, windows, task.measurement, steps, memory=memory)
         # As recorded: with the motions and the encoder offsets of the constant fit.
         found = replace(
             found, model=model, motions=self.motions, encoder_offsets=constant.encoder_offsets,
