@@ -118,7 +118,10 @@ class Schedule(nn.Module, ABC):
         return coefficients
 
     def coefficient_sets(self) -> dict[str, Tensor]:
-        """Coefficients that describe the model, (joint, coefficient) each, by where they apply."""
+        """Coefficients that describe the model, (joint, coefficient) each, by where they apply.
+
+        Coefficients that do not change have one set, `always`.
+        """
         return {"at_rest": self.rest_coefficients().detach()}
 
     def fuzzy_rules(self) -> FuzzyRules | None:

@@ -171,7 +171,10 @@ class NeuroFuzzy(Schedule):
         return self.to_coefficients(self.reference)
 
     def coefficient_sets(self) -> dict[str, Tensor]:
-        return super().coefficient_sets() | {"reference": self.reference_coefficients().detach()}
+        reference = self.reference_coefficients().detach()
+        if self.fuzzy_rules().constant:
+            return {"always": reference}
+        return super().coefficient_sets() | {"reference": reference}
 
     @torch.no_grad()
     def fuzzy_rules(self) -> FuzzyRules:

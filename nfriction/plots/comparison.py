@@ -19,7 +19,6 @@ from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names
-from nfriction.friction.models import FrictionModel
 from nfriction.plots import style
 from nfriction.plots.drawing import mechanism
 from nfriction.plots.friction_torque import torque_over_velocity
@@ -426,18 +425,14 @@ def _figures(
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
     for law in dict.fromkeys(model.law.name for model in models.values()):
         # Constants along the motion are worth a figure beside coefficients that follow it.
-        if any(_follows_motion(m) for m in models.values() if m.law.name == law):
+        sets = [m.schedule.coefficient_sets() for m in models.values() if m.law.name == law]
+        if any("always" not in of_model for of_model in sets):
             figure = coefficients_over_time(models, last.motions[0], law=law, **labels)
             yield f"over_time_{law}", figure
     for name, found in comparison.fits.items():
-        if found.model.schedule.fuzzy_rules() is not None and _follows_motion(found.model):
+        rules = found.model.schedule.fuzzy_rules()
+        if rules is not None and not rules.constant:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
             yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
             yield f"sections_{name}", coefficient_sections(found.model, **known)
             yield f"memberships_{name}", memberships(found.model, **labels)
-
-
-def _follows_motion(model: FrictionModel) -> bool:
-    """True unless the coefficients are constants, as also those of a rejected network."""
-    rules = model.schedule.fuzzy_rules()
-    return model.schedule.follows_motion if rules is None else not rules.constant

@@ -308,5 +308,9 @@ def test_coefficients_that_follow_the_motion_say_what_they_hold_for():
     assert [adaptive[known]["C"] for known in ("low", "medium", "high")] == [
         pytest.approx([2.0]), pytest.approx([4.0]), pytest.approx([6.0])
     ]  # fmt: skip
-    fuzzy = coefficient_summary(NFLFM(1, [3.0, 4.0]))
-    assert fuzzy["at_rest"] == {n: pytest.approx(v) for n, v in fuzzy["reference"].items()}
+    network = NFLFM(1, [3.0, 4.0])
+    assert coefficient_summary(network) == {"B": pytest.approx([3.0]), "C": pytest.approx([4.0])}
+    network.schedule.set_parameter_vector(network.schedule.parameter_vector() + 0.1)
+    fuzzy = coefficient_summary(network)
+    assert fuzzy["reference"] == {"B": pytest.approx([3.0]), "C": pytest.approx([4.0])}
+    assert fuzzy["at_rest"]["C"] != pytest.approx([4.0], rel=1e-3)

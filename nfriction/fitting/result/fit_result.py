@@ -246,15 +246,12 @@ class FitResult:
 
         joints, schedule = self.plant.joint_names, self.model.schedule
         rows: dict[str, tuple[float, float, float]] = {}
-        known = {i.name: (i.value, i.low, i.high) for i in self.intervals}
         for label, values in schedule.coefficient_sets().items():
             where = "" if label == "always" else f", {label.replace('_', ' ')}"
             for joint, of_joint in zip(joints, values.tolist(), strict=True):
                 for name, value in zip(schedule.coefficient_names, of_joint, strict=True):
-                    # Where the constant law is kept, its coefficient applies everywhere.
-                    own = f"{name} of {joint}"
-                    rows[own if own in known else own + where] = (value, math.nan, math.nan)
-        rows |= known
+                    rows[f"{name} of {joint}{where}"] = (value, math.nan, math.nan)
+        rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
         table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
         unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
         table["note"] = [

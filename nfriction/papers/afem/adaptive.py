@@ -184,7 +184,9 @@ class Adaptive(Tabulated):
 
     @torch.no_grad()
     def coefficient_sets(self) -> dict[str, Tensor]:
-        return dict(zip(CLASSES, self.rest_coefficients().detach(), strict=True))
+        sets = self.rest_coefficients().detach()
+        constant = bool((sets == sets[0]).all())
+        return {"always": sets[0]} if constant else dict(zip(CLASSES, sets, strict=True))
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
         # As in the base class, but without a step of torch to every sample.
