@@ -60,11 +60,11 @@ class Table:
         return column > 0 and not any(isinstance(row[column], str) for row in self.rows)
 
     def is_marked(self, row: Sequence[Value], column: int) -> bool:
-        """True where a row has the least number of a marked column, and that is finite."""
+        """True where a marked column shows its least number, and that is finite."""
         if column not in self.marked:
             return False
         least = self._least(column)
-        return math.isfinite(least) and row[column] == least
+        return math.isfinite(least) and self.text(row[column]) == self.text(least)
 
     def is_tied(self, row: Sequence[Value], column: int) -> bool:
         """True where a marked column's least number has others within the limit, and row is one."""

@@ -430,8 +430,7 @@ def _figures(
             figure = coefficients_over_time(models, last.motions[0], law=law, **labels)
             yield f"over_time_{law}", figure
     for name, found in comparison.fits.items():
-        rules = found.model.schedule.fuzzy_rules()
-        if rules is not None and not rules.constant:
+        if (rules := found.model.schedule.fuzzy_rules()) is not None and not rules.constant:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
             yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
             yield f"sections_{name}", coefficient_sections(found.model, **known)

@@ -168,7 +168,11 @@ def friction_curves(fits: "TorqueFits") -> Figure:
     shown: list[str] = []
     bins = False
     for k, (joint, ax) in enumerate(zip(joints, axes, strict=True)):
-        chosen, *others = _drawn(fits, joint)
+        chosen = fits.chosen[joint.name]
+        unlike = [
+            c for c in fits.candidates[joint.name] if _remembers(c.name) != _remembers(chosen)
+        ]
+        others = [c.name for c in sorted(unlike, key=lambda c: c.error)[:1]]
         shown += [chosen, *others]
         looped = _remembers(chosen)
         draw = _loops if looped else _curves
@@ -193,13 +197,6 @@ def friction_curves(fits: "TorqueFits") -> Figure:
 
 def _remembers(name: str) -> bool:
     return model_by_name(name).definition.memory is not None
-
-
-def _drawn(fits: "TorqueFits", joint: "JointTorque") -> list[str]:
-    """The law chosen, and the best with or without memory, unlike it, if there is one."""
-    chosen = fits.chosen[joint.name]
-    others = [c for c in fits.candidates[joint.name] if _remembers(c.name) != _remembers(chosen)]
-    return [chosen, *(c.name for c in sorted(others, key=lambda c: c.error)[:1])]
 
 
 def _loops(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str, Any]]]) -> str:

@@ -241,7 +241,12 @@ def coefficient_surfaces(
         counts = None if motions is None else _visits(rules, motions, j)
         seen = None if counts is None else _near(counts)
         for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
-            opacity = None if sd is None else _opacity(values[..., k], sd[..., k], seen)
+            opacity = None
+            if sd is not None:
+                # 1 where all is known, about half at a deviation of `VAGUE`.
+                among = np.abs(values[..., k][... if seen is None or not seen.any() else seen])
+                vague = VAGUE * (float(among.mean()) or 1.0)
+                opacity = _LEAST + (1.0 - _LEAST) / (1.0 + (sd[..., k] / vague) ** 4)
             label = (coefficient.name, style.sliding(coefficient.unit, unit))
             draw_map(ax, edges, values[..., k], label=label, seen=seen, opacity=opacity)
             if counts is not None:
@@ -390,13 +395,6 @@ def _limit(ax: Axes, values: Array, reach: Array, positive: bool) -> None:
     ax.set_ylim(*style.padded(bottom, min(float((values + reach).max()), high + most)))
     if positive:
         ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
-
-
-def _opacity(value: Array, sd: Array, seen: NDArray[np.bool_] | None) -> Array:
-    """Opacity of a map: 1 where all is known, about half at a deviation of `VAGUE`."""
-    among = np.abs(value) if seen is None or not seen.any() else np.abs(value[seen])
-    size = float(among.mean()) or 1.0
-    return _LEAST + (1.0 - _LEAST) / (1.0 + (sd / (VAGUE * size)) ** 4)
 
 
 def _density_lines(ax: Axes, middles: Edges, counts: Array) -> None:

@@ -88,6 +88,12 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
         if values is not None:
             _check_values(key, values)
     _check_stamps(time)
+    # No encoder's step is a radian.
+    if unit == "rad" and np.ptp(q) > 1 and (q == np.rint(q)).all():
+        raise ValueError(
+            f"`q` must be in radians, got whole numbers alone, from {q.min():g} to {q.max():g}; "
+            'state the unit, as in columns={"q1": "q1:counts/8192"} or `degrees=True`.'
+        )
 
 
 def _check_values(key: str, values: Array) -> None:

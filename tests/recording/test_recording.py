@@ -723,3 +723,12 @@ def test_a_motor_unknown_to_the_rig_is_named() -> None:
     with pytest.warns(RecordingWarning, match="looks like motor current"):
         found = Recording.from_pandas(table.rename(columns={"I": "current1"}), plant=rig)
     assert found.tau is None
+
+
+@pytest.mark.parametrize("size", [1.0, 20.0])
+def test_positions_in_whole_degrees_or_counts_are_refused(size):
+    q, time = np.rint(np.linspace(0, 360 * size, 50))[:, None], np.arange(50) / 100
+    with pytest.raises(ValueError, match=r"radians, got whole numbers alone, from 0 to .*counts"):
+        Recording(time, q)
+    assert Recording(time, q, unit="m").unit == "m"
+    assert Recording(time, np.ones_like(q)).joints == 1
