@@ -109,4 +109,4 @@ def fit(
         )
     # By name, so that a schedule outside the core brings a strategy of its own.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
-    return strategy(task).with_warnings(task.data_warnings, task.mistakes)
+    return strategy(task).with_warnings(task.data_warnings, task.mistakes, task.unmodelled)

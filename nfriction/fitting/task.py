@@ -57,6 +57,7 @@ class FitTask:
         delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
         mistakes: likely mistakes in recordings or plant.
+        unmodelled: of `data_warnings`, changes of friction and play that no model here has.
     """
 
     model: FrictionModel
@@ -71,6 +72,7 @@ class FitTask:
     delay: float = 0.0
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
+    unmodelled: tuple[str, ...] = ()
 
 
 def prepare_task(
@@ -115,26 +117,18 @@ def prepare_task(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
     of = plant, advanced, moved, options
+    unmodelled = () if mistakes else (*changing_friction(*of), *loose_loads(*of))
     found = (
-        *(mistake_warning(stated, mistakes) or (*changing_friction(*of), *loose_loads(*of))),
+        *mistake_warning(stated, mistakes),
+        *unmodelled,
         *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
     )
     measurement = measurement_matrix(plant, convention)
     return FitTask(
-        model,
-        plant,
-        joint,
-        measurement,
-        moved,
-        options,
-        start,
-        callback,
-        per_recording,
-        delay,
-        found,
-        tuple(m.text for m in mistakes),
-    )
+        model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
+        found, tuple(m.text for m in mistakes), unmodelled,
+    )  # fmt: skip
 
 
 def _zeroed_per_recording(

@@ -190,7 +190,10 @@ class Anfis(LinearOutputModule):
         self._write_regressors(F[:, :shared], strengths, terms)
         z, h, by_slope = self._premises(u)
         # The strengths' sums over the rules that use a set are the sets' shares p.
-        uses = _incidence(self.terms).to(u)
+        choice = torch.cartesian_prod(*(torch.arange(n) for n in self.terms))
+        choice = choice.reshape(-1, len(self.terms))
+        pairs = zip(choice.T, self.terms, strict=True)
+        uses = torch.cat([torch.nn.functional.one_hot(c, n).T for c, n in pairs]).to(u)
         shares = uses @ strengths
         sets = F[:, shared:].unflatten(1, (self.outputs, own // z.shape[1], z.shape[1]))
         for k in range(self.outputs):
@@ -369,10 +372,3 @@ def _check_sizes(
         raise ValueError(f"`order` is 0 (constant consequents) or 1 (linear ones), got {order}.")
     if kind not in ("gaussian", "bell"):
         raise ValueError(f'`kind` is "gaussian" or "bell", got {kind!r}.')
-
-
-def _incidence(terms: list[int]) -> Tensor:
-    """1 where a rule uses a set, shape (sets, rules); the last input's set runs fastest."""
-    choice = torch.cartesian_prod(*(torch.arange(n) for n in terms)).reshape(-1, len(terms))
-    rows = [torch.nn.functional.one_hot(choice[:, i], n).T for i, n in enumerate(terms)]
-    return torch.cat(rows)

@@ -147,6 +147,17 @@ def test_play_in_a_gear_is_named(play, named):
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
 
 
+def test_a_fit_to_a_motor_whose_gear_has_play_is_doubtful():
+    q, tau = geared(math.radians(1.0))
+    recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
+    given = {"windows": (0.1,), "max_steps": 1}
+    found = fit(CVFM(1), PendulumChain(**MOTOR), recording, **given)
+    assert found.usability[0] == "doubtful"
+    assert "a gear has play" in found.usability[1]
+    again = fit(CVFM(1), PendulumChain(**MOTOR), recording, start=found, **given)
+    assert again.unmodelled == found.unmodelled
+
+
 @pytest.mark.parametrize("samples", [50, 130, 200])
 def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
     q, tau = geared(math.radians(1.0))

@@ -89,6 +89,7 @@ class FitResult:
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
+        unmodelled: of `data_warnings`, changes of friction and play that no model here has.
         noise: root mean square residual of a right law, by the noise of encoders and torque
             [rad; m]; None after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
@@ -117,6 +118,7 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
+    unmodelled: tuple[str, ...] = ()
     noise: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
@@ -130,13 +132,19 @@ class FitResult:
         return usable[-1] if usable else windows[0]
 
     def with_warnings(
-        self, data_warnings: Sequence[str], mistakes: Sequence[str] = ()
+        self,
+        data_warnings: Sequence[str],
+        mistakes: Sequence[str] = (),
+        unmodelled: Sequence[str] = (),
     ) -> "FitResult":
         """The same with these warnings about the data first, each once."""
         every = tuple(dict.fromkeys((*data_warnings, *self.data_warnings)))
         others = (w for w in self.warnings if w not in every)
-        named = tuple(dict.fromkeys((*mistakes, *self.mistakes)))
-        return replace(self, data_warnings=every, warnings=(*every, *others), mistakes=named)
+        return replace(
+            self, data_warnings=every, warnings=(*every, *others),
+            mistakes=tuple(dict.fromkeys((*mistakes, *self.mistakes))),
+            unmodelled=tuple(dict.fromkeys((*unmodelled, *self.unmodelled))),
+        )  # fmt: skip
 
     @property
     def usability(self) -> tuple[Usability, str]:
@@ -169,6 +177,8 @@ class FitResult:
             return "do not use", far
         if not self.converged:
             reasons.append("the search did not converge")
+        if self.unmodelled:
+            reasons.append("friction changes or a gear has play, see the warnings")
         if wrong:
             reasons.append(far)
         # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.
