@@ -92,7 +92,7 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
     if unit == "rad" and np.ptp(q) > 1 and (q == np.rint(q)).all():
         raise ValueError(
             f"`q` must be in radians, got whole numbers alone, from {q.min():g} to {q.max():g}; "
-            'state the unit, as in columns={"q1": "q1:counts/8192"} or `degrees=True`.'
+            "state the unit: counts of a turn by the column, as in q1=q1:counts/8192, or degrees."
         )
 
 

@@ -114,7 +114,7 @@ def test_options_tell_how_files_are_written(
 def test_degrees_are_told_once_with_the_option_that_helps(
     bench: Path, failing, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = "".join(f"{0.1 * k},{400.0 * k}\n" for k in range(9))
+    rows = "".join(f"{0.1 * k},{400.5 * k}\n" for k in range(9))
     wheels = [bench / "wheel.csv", bench / "cart.csv"]
     for k, path in enumerate(wheels):
         path.write_text("time,q1\n" + rows + f"0.9,{3600 + k}\n")

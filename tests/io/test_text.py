@@ -194,7 +194,7 @@ def test_thousands_are_recognised_by_the_whole_file(
     values, time = BY_COLUMN[case]
     if time and separator == ".":
         time = [stamp.replace(".", ",") for stamp in time]
-    back = read(tmp_path, log([thousands(x, separator) for x in values], time))
+    back = read(tmp_path, log([thousands(x, separator) for x in values], time), unit="m")
     assert np.array_equal(back.q[:, 0], values)
     assert not [w for w in recwarn if "thousands" in str(w.message)]
 
@@ -215,11 +215,11 @@ def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separ
     with pytest.warns(
         RecordingWarning, match=r"q1 .*3[56].*assumed is that it is a decimal sign; .*# decimal"
     ):
-        assert np.array_equal(read(tmp_path, text).q[:, 0], COUNTS / 1000)
+        assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], COUNTS / 1000)
     for decimal, scale in ((separator, 1000), ({",": ".", ".": ","}[separator], 1)):
         with warnings.catch_warnings():
             warnings.filterwarnings("error", "column", RecordingWarning)
-            back = read(tmp_path, f"# decimal: {decimal}\n{text}")
+            back = read(tmp_path, f"# decimal: {decimal}\n{text}", unit="m")
         assert np.array_equal(back.q[:, 0], COUNTS / scale)
 
 
@@ -228,7 +228,7 @@ def test_a_motion_through_a_thousand_is_followed_and_said(tmp_path: Path, separa
     counts = COUNTS - 34_900
     text = log([thousands(int(x), separator) for x in counts])
     with pytest.warns(RecordingWarning, match="assumed is that it separates thousands"):
-        assert np.array_equal(read(tmp_path, text).q[:, 0], counts)
+        assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], counts)
 
 
 def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
@@ -241,7 +241,7 @@ def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
 
 def test_numbers_in_quotation_marks_may_hold_commas(tmp_path: Path) -> None:
     text = log([f'"{x:,}"' for x in [0, *COUNTS.tolist(), 1_234_567]], separator=",")
-    assert np.array_equal(read(tmp_path, text).q[:, 0], [0, *COUNTS, 1_234_567])
+    assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], [0, *COUNTS, 1_234_567])
     # What nobody asks for decides nothing.
     noted = written(",", False, "time{0}q1{0}q2{0}note").replace("\n", ',"0,5"\n')
     assert np.array_equal(read(tmp_path, noted.replace(',"0,5"', "", 1)).q, Q)
