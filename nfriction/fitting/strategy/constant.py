@@ -112,7 +112,7 @@ def fit_constant(task: FitTask) -> FitResult:
     )
     skipped = f"Windows of {' and '.join(f'{length:g}' for length in search.skipped)} s"
     why = SKIPPED.get(search.reason)
-    said, late = [f"{skipped} were skipped: {why}."] if why else [], []
+    said = [f"{skipped} were skipped: {why}."] if why else []
     if search.reason == "noisy":
         noisy = f"{skipped} were not needed: over them noise of the torque adds up"
         fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")
@@ -120,8 +120,8 @@ def fit_constant(task: FitTask) -> FitResult:
     if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
         rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
-        late = delay_warning(found, _fitter(with_delay, model, torque, eccentric or rich))
-    return fitted.with_warnings([*said, *late], unmodelled=late)
+        said += delay_warning(found, _fitter(with_delay, model, torque, eccentric or rich))
+    return fitted.with_warnings(said)
 
 
 def _fitter(
