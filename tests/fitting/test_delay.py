@@ -6,18 +6,37 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LinearAxis, Recording, compare, fit
+from nfriction import CVFM, LinearAxis, Recording, compare, fit, rollout
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import F64, driven_axis, pendulum, swing
+from nfriction.papers.afem.adaptive import ACVFM
+from nfriction.signals import kalman_smoother, quantise
+from tests.fitting.recordings import COUNTS, F64, driven_axis, pendulum, swing
 
 LATE = 0.0137
 TRUTH = [0.8, 2.0]
+
+
+DRY = [[2e-3, 1e-3], [2e-3, 1e-3]]
+
+
+def driven_pendulum(seed: int) -> Recording:
+    """A double pendulum whose torques change within samples and are logged at each."""
+    random, plant = np.random.default_rng(seed), pendulum()
+    time = 1e-4 * np.arange(40_001)
+    rate, phase = random.uniform(3.0, 12.0, (3, 2)), random.uniform(0.0, 6.0, (3, 2))
+    tau = 0.1 * np.sin(rate * time[:, None, None] + phase).sum(1)
+    rest = torch.tensor([np.pi, 0.0], dtype=F64)
+    out = rollout(
+        plant, CVFM(2, DRY, v_smooth=0.003), rest, 0 * rest, torch.as_tensor(tau[:-1]),
+        sample_time=1e-4, gradients=False,
+    )  # fmt: skip
+    q = quantise(out.q.numpy(), COUNTS)
+    return Recording(time, q, tau=tau, convention="relative,upright")[::10]
 
 
 def delayed(name: str = "axis", seconds: float = 3.0) -> Recording:
@@ -106,5 +125,30 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
     late = 0.5 * (measured.sample_time - fine.sample_time)
     (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", said)
     assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
+    # Friction depends on the delay, also that of a model which starts from such a fit.
+    assert "F_c of joint1 0.8" in said
+    start = {"start": found, "windows": (0.5,), "max_steps": 1}
+    by_class = fit(ACVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **start)
+    for told in (found, by_class):
+        assert told.usability[0] == "doubtful"
+        assert "there is a delay" in told.usability[1]
     held = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), fine, **settings)
     assert not any("delay" in text for text in held.warnings)
+
+
+@pytest.mark.parametrize(("seed", "verdict"), [(3, "doubtful"), (1, "good")])
+def test_a_delay_makes_a_fit_doubtful_where_coefficients_leave_their_intervals(seed, verdict):
+    recording = driven_pendulum(seed)
+    found, right = (
+        fit("coulomb-viscous", pendulum(), recording, windows=(0.5,), fit_delay=fitted)
+        for fitted in (False, True)
+    )
+    (said,) = (text for text in found.warnings if "Perhaps torques" in text)
+    assert found.usability[0] == verdict
+    own = zip(found.intervals[:4], np.ravel(DRY), strict=True)
+    assert all(i.low <= x <= i.high for i, x in own) == (verdict == "good")
+    assert ("leave their intervals" in said) == (verdict == "doubtful")
+    assert right.usability == ("good", "")
+    torch.testing.assert_close(
+        right.model.schedule.values, torch.tensor(DRY, dtype=F64), rtol=0.03, atol=0
+    )

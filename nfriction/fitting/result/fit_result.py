@@ -89,7 +89,7 @@ class FitResult:
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
-        unmodelled: of `data_warnings`, changes of friction and play that no model here has.
+        unmodelled: of `data_warnings`, changes of friction, play and delays that the fit lacks.
         noise: root mean square residual of a right law, by the noise of encoders and torque
             [rad; m]; None after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
@@ -178,7 +178,7 @@ class FitResult:
         if not self.converged:
             reasons.append("the search did not converge")
         if self.unmodelled:
-            reasons.append("friction changes or a gear has play, see the warnings")
+            reasons.append("friction changes, a gear has play or there is a delay, see warnings")
         if wrong:
             reasons.append(far)
         # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.

@@ -99,8 +99,7 @@ def fit_constant(task: FitTask) -> FitResult:
     undecided = start is None and options.eccentricity == "auto" and options.fit_plant
     if undecided and isinstance(task.plant, PendulumChain) and not found.stopped:
         richer = _fitter(task, model, torque, eccentric=True)
-        tolerance = loglik_tolerance(found.result.cost, options)
-        found = richer_by_evidence(found, richer, tolerance) or found
+        found = richer_by_evidence(found, richer, "eccentric encoders") or found
     ambiguous: list[str] = []
     if "sigma_0" in model.law.names and not found.stopped:
         ambiguous = ambiguous_stiffness(fitter, found, search.stages[0])
@@ -120,7 +119,9 @@ def fit_constant(task: FitTask) -> FitResult:
     if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
         rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
-        said += delay_warning(found, _fitter(with_delay, model, torque, eccentric or rich))
+        delayed = _fitter(with_delay, model, torque, eccentric or rich)
+        late, biased = delay_warning(found, delayed, fitted.intervals)
+        fitted = fitted.with_warnings(late, unmodelled=late if biased else ())
     return fitted.with_warnings(said)
 
 

@@ -1,30 +1,33 @@
 """Further plant terms, by evidence: eccentric encoders, and the delay of the torque."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.diagnosis import delay_in_words
+from nfriction.fitting.result.identifiability import Interval
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
+from nfriction.fitting.strategy.continuation import (
+    HorizonResult,
+    ShootingFitter,
+    loglik_tolerance,
+)
 from nfriction.optim.least_squares import Quadratic
 
-LATE = (
-    "Perhaps {}: with that delay the residual would fall by about {:.0f} %, and coefficients may "
-    "move by more than their intervals."
-)
+LATE = "Perhaps {}: with that delay the residual falls by {:.0f} %, and coefficients {}."
 
 
 def richer_by_evidence(
-    base: HorizonResult, richer: ShootingFitter, tolerance: float
+    base: HorizonResult, richer: ShootingFitter, name: str
 ) -> HorizonResult | None:
-    """The stage with encoder terms if the data ask for them, else None.
+    """The stage with further terms if the data ask for them, else None.
 
     The two plants are compared by their evidence in Laplace's approximation: the decrease of the
     cost less the Occam factor of the new terms, with residuals inflated for autocorrelation. A
     first prediction of the decrease from derivatives alone may save the search. The terms of
-    `richer` are those of `base`, then the encoders'.
+    `richer` are those of `base`, then the further ones; `name` is the stage's for the callback.
 
     References:
         D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
@@ -36,26 +39,34 @@ def richer_by_evidence(
     problem, before = further.problem, further.before
     zeros = torch.zeros(further.count, dtype=torch.float64)
     start = problem.variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
-    found = richer.search(problem, start, tolerance, "eccentric encoders")
+    tolerance = loglik_tolerance(base.result.cost, richer.options)
+    found = richer.search(problem, start, tolerance, name)
     end = found.result
     gain = float(before.cost) - float(end.cost)
     better = gain + further.occam(Quadratic(end.cost, end.gradient, end.hessian)) > 0
     return found if better else None
 
 
-def delay_warning(found: HorizonResult, delayed: ShootingFitter) -> list[str]:
-    """A sentence on the delay between torques and positions that the data ask for, if any.
+def delay_warning(
+    found: HorizonResult, delayed: ShootingFitter, intervals: Sequence[Interval]
+) -> tuple[list[str], bool]:
+    """A sentence on the delay of the torque that the data ask for, and if friction depends on it.
 
-    By derivatives alone: a delay below a sample hardly shows in the balance of torques, but it
-    biases coefficients by more than their intervals.
+    A delay below a sample hardly shows in the balance of torques. A wrong law feigns a delay, too;
+    so friction depends on it only where a coefficient leaves its interval once the delay is fitted.
     """
-    further = _FurtherTerms.of(found, delayed)
-    if further is None or further.predicted_gain() <= 0:
-        return []
-    delay = float(further.step()[further.first])
-    fall = 1.0 - max(0.0, 1.0 - further.decrease() / float(further.before.cost)) ** 0.5
+    late = richer_by_evidence(found, delayed, "delay of the torque")
+    fall = 0 if late is None else round(100 * (1 - late.rms / found.rms))
     # By no whole percent: in chaotic windows evidence counts what residuals do not show.
-    return [] if round(100 * fall) < 1 else [LATE.format(delay_in_words(delay), 100 * fall)]
+    if late is None or fall < 1:
+        return [], False
+    names = delayed.friction.schedule.parameter_names(delayed.jacobian.plant.joint_names)
+    values = dict(zip(names, late.parts.friction.tolist(), strict=True))
+    own = [(i, values[i.name]) for i in intervals if i.name in values]
+    left = ", ".join(f"{i.name} {x:.3g}" for i, x in own if not i.low <= x <= i.high)
+    where = f"leave their intervals: {left}" if left else "stay within their intervals"
+    delay = delay_in_words(float(late.parts.plant[-1]))
+    return [LATE.format(delay, fall, where)], bool(left)
 
 
 @dataclass(frozen=True)
@@ -93,29 +104,17 @@ class _FurtherTerms:
         volume = _log_volume(after, self.both) - _log_volume(self.before, self.known)
         return 0.5 * (float(precision.log().sum()) - volume)
 
-    def step(self) -> Tensor:
-        """Gauss-Newton step with the further terms, (variable,)."""
-        step = torch.zeros_like(self.before.gradient)
-        step[self.both] = -_newton_step(self.before, self.both)
-        return step
-
-    def decrease(self) -> float:
-        """Decrease of the cost by the further terms that derivatives predict."""
-        return _newton_decrease(self.before, self.both) - _newton_decrease(self.before, self.known)
-
     def predicted_gain(self) -> float:
         """Gain of the log evidence that derivatives predict."""
-        return self.decrease() + self.occam(self.before)
-
-
-def _newton_step(local: Quadratic, chosen: Tensor) -> Tensor:
-    slope = local.gradient[chosen]
-    return torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution
+        decrease = _newton_decrease(self.before, self.both)
+        return decrease - _newton_decrease(self.before, self.known) + self.occam(self.before)
 
 
 def _newton_decrease(local: Quadratic, chosen: Tensor) -> float:
     """Decrease of the cost that its quadratic model predicts when the chosen variables move."""
-    return 0.5 * float(local.gradient[chosen] @ _newton_step(local, chosen))
+    slope = local.gradient[chosen]
+    step = torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution
+    return 0.5 * float(slope @ step)
 
 
 def _log_volume(local: Quadratic, chosen: Tensor) -> float:

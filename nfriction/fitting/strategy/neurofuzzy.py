@@ -98,7 +98,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
     found = replace(found, status=" ".join([found.status, *said]))
-    return found.with_warnings(start.data_warnings)
+    return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:

@@ -406,7 +406,7 @@ class ClassFit:
                 part = "" if share == 1.0 else f" {share:g} of the deviations by class is taken."
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)
                 taken = replace(found, residual=rms, residuals=residuals, status=status)
-                return taken.with_warnings(constant.data_warnings)
+                return taken.with_warnings(constant.data_warnings, unmodelled=constant.unmodelled)
         return self.kept("The classes simulate no better")
 
     def kept(self, reason: str, *, converged: bool = True) -> FitResult:

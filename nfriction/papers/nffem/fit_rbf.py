@@ -85,7 +85,7 @@ def fit_rbf(task: FitTask) -> FitResult:
         found, plant_terms=start.plant_terms, encoder_offsets=start.encoder_offsets,
         skipped_horizons=start.skipped_horizons,
     )  # fmt: skip
-    return found.with_warnings(start.data_warnings)
+    return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
 @torch.no_grad()
