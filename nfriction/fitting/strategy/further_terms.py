@@ -1,7 +1,7 @@
 """Further plant terms, by evidence: eccentric encoders, and the delay of the torque."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -9,11 +9,7 @@ from torch import Tensor
 from nfriction.fitting.diagnosis import delay_in_words
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.strategy.continuation import (
-    HorizonResult,
-    ShootingFitter,
-    loglik_tolerance,
-)
+from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter, loglik_tolerance
 from nfriction.optim.least_squares import Quadratic
 
 LATE = "Perhaps {}: with that delay the residual falls by {:.0f} %, and coefficients {}."
@@ -86,7 +82,10 @@ class _FurtherTerms:
         count = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
         if not base.noise > 0 or count < 1:
             return None
-        problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
+        own = base.problem
+        problem = richer.problem(own.windows, base.noise, base.parts.friction)
+        # Costs by another integration or loss are not comparable.
+        problem = replace(problem, substeps=own.substeps, loss=own.loss)
         first = base.problem.variables.shared_count
         zeros = torch.zeros(count, dtype=torch.float64)
         at_base = torch.cat([base.result.x[:first], zeros, base.result.x[first:]])
