@@ -239,8 +239,8 @@ class Comparison:
     def unfit(self) -> dict[str, str]:
         """Models not to be used, with the reason: one no larger predicts the test far better.
 
-        A model that is worse than no friction, or at least twice as bad as one with no more
-        parameters by more than the limit of these data, extrapolates wrongly from its training.
+        A model worse than no friction, or at least twice as bad as one with no more parameters by
+        more than the limit of these data, extrapolates wrongly; any that errs as much is no fitter.
         """
         if not self.test:
             return {}
@@ -251,12 +251,13 @@ class Comparison:
             least = smaller.min()
             # Where all of these diverge, none is known to be better.
             if np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
-                best = f"{smaller.idxmin()} with no more parameters"
-                found[str(name)] = f"{best} has {1e3 * least:.3g} m{self.unit}, " + (
-                    f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges"
-                )
+                best = f"{smaller.idxmin()} with no more parameters has {1e3 * least:.3g}"
+                own = f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges"
+                found[str(name)] = f"{best} m{self.unit}, {own}"
             elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
                 found[str(name)] = "no friction predicts better"
+        for name in rmse.index[rmse >= rmse[[*found]].min()].drop(NO_FRICTION, errors="ignore"):
+            found.setdefault(str(name), "it predicts no better than a model that is not to be used")
         return found
 
     def _parameters(self, name: str) -> int:

@@ -294,6 +294,11 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison):
     # As many parameters are no excuse.
     equal = dataclasses.replace(found, fits={**found.fits, "CVFM": found.fits["LFM"]})
     assert set(scored(equal, no_friction=5.0, CVFM=1.0, LFM=2.1).unfit()) == {"LFM"}
+    # A smaller model gets no better verdict for the same error.
+    errors = {"no_friction": 5.0, "NCFM": 2.1, "CVFM": 1.0, "LFM": 2.1}
+    reasons = scored(equal, **errors).unfit()
+    assert reasons["NCFM"] == "it predicts no better than a model that is not to be used"
+    assert set(scored(equal, **errors | {"NCFM": 2.0}).unfit()) == {"LFM"}
     # The data do not separate these.
     assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}
     assert dataclasses.replace(found, test={}).unfit() == {}
