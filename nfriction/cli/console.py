@@ -84,7 +84,7 @@ _OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ..
         lambda found: '--columns "' + found[1].replace('": "', "=").replace('", "', ",")[1:],
     ),
     (re.compile(r"`degrees=True`"), "--degrees"),
-    (re.compile(r"`fit_delay=True`(, or `recording\.advance_torque\([\d.]+\)`)?"), "--fit-delay"),
+    (re.compile(r"`fit_delay=True`(, or `recording\.advance_torque\([^)]+\)`)?"), "--fit-delay"),
     (re.compile(r"`columns`"), "--columns"),
     (
         re.compile("create the model yourself and pass it as `into`"),

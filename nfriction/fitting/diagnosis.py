@@ -612,8 +612,8 @@ def delay_in_words(delay: float) -> str:
     """A delay of torques after positions [s], and how to remove it, as a clause."""
     words = ("torques", "positions") if delay > 0 else ("positions", "torques")
     return (
-        f"{words[0]} are recorded {1e3 * abs(delay):.1f} ms later than {words[1]} "
-        f"(`fit_delay=True`, or `recording.advance_torque({delay:.4f})`)"
+        f"{words[0]} are recorded {1e3 * abs(delay):.3g} ms later than {words[1]} "
+        f"(`fit_delay=True`, or `recording.advance_torque({delay:.3g})`)"
     )
 
 

@@ -112,7 +112,7 @@ def test_installed_command_fails_in_one_line() -> None:
 
 
 def test_advice_for_python_becomes_that_for_the_command_line() -> None:
-    told = "torques are late (`fit_delay=True`, or `recording.advance_torque(0.0300)`). Corrected"
+    told = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
     assert one_line(told) == "torques are late (--fit-delay). Corrected"
 
 
