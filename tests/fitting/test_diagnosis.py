@@ -487,6 +487,14 @@ def test_a_step_at_a_gap_is_no_spike():
     assert not any("jumps" in warning for warning in found)
 
 
+@pytest.mark.parametrize("missing", [1, 3])
+def test_samples_missing_with_their_times_are_no_jump(missing):
+    plant, q, tau = measured("wheel", count=COUNT / 50)
+    kept = np.r_[0:1000, 1000 + missing : len(q)]
+    found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
+    assert not any("jumps" in warning for warning in found)
+
+
 def test_a_fit_names_the_mistake_first():
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")

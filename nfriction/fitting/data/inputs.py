@@ -30,6 +30,7 @@ from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
+from nfriction.recording.validation import gaps
 from nfriction.signals import Motion, count_seen, kalman_smoother
 from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
@@ -375,11 +376,13 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        # Steps far above both that enclose them, which are alike; across a gap any is possible.
-        step = np.diff(q, axis=0)
+        # Steps far above both that enclose them, which are alike, if all were equally long; across a
+        # gap any is possible.
+        step = np.diff(q, axis=0) * (recording.sample_time / np.diff(time))[:, None]
+        step[gaps(time)] = np.nan
         before, at, after = step[:-2], step[1:-1], step[2:]
         height = np.minimum(np.abs(at - before), np.abs(at - after))
-        height[(2 * np.abs(after - before) > height) | _gaps(recording)[1:-1, None]] = 0.0
+        height = np.where(2 * np.abs(after - before) <= height, height, 0.0)
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
         columns = zip(recording.names, far.T, lasting.T, height.T, strict=True)
         for name, peak, jump, high in columns:
@@ -400,14 +403,6 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
             yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
-
-
-def _gaps(recording: Recording) -> NDArray[np.bool_]:
-    """True for steps that lie in no segment, (step,)."""
-    gap = np.ones(len(recording) - 1, dtype=bool)
-    for first, last in recording.segments:
-        gap[first:last] = False
-    return gap
 
 
 def _times(found: Array) -> str:
