@@ -14,12 +14,7 @@ from nfriction.codegen.graph import Program, trace
 from nfriction.codegen.scalar import Node, UnsupportedOperation, evaluate, reachable
 from nfriction.export.c_dialect import ControllerC, Real, comment, statements
 from nfriction.export.contract import ExportError
-from nfriction.export.controller import (
-    FILTER_STATE,
-    UNBOUNDED,
-    Controller,
-    for_single_precision,
-)
+from nfriction.export.controller import FILTER_STATE, UNBOUNDED, Controller, for_single_precision
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant

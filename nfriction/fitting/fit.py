@@ -62,7 +62,8 @@ def fit(
             convention, by default the plant's.
         method: `"equation_error"` stops after the regression (constant coefficients only).
         windows: lengths of the shooting windows [s], in the order in which they are used.
-        fit_plant: adjust ratios of inertia and gravity terms, lengths and offsets, within bounds.
+        fit_plant: adjust inertia and gravity terms, lengths, encoder zeros, gear losses, torque
+            constants and a constant torque of each drive, within bounds.
         drag: also fit air drag on the links. None fits it to an undriven chain on a fixed pivot: a
             free swing loses as much to the air as to its joints, whose coefficients would absorb
             the drag.

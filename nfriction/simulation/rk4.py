@@ -16,13 +16,7 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen.rollout import SPEED_LIMIT
-from nfriction.simulation.protocols import (
-    Friction,
-    Plant,
-    RolloutInputs,
-    StepFunction,
-    as_stateful,
-)
+from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, StepFunction, as_stateful
 
 
 def acceleration(

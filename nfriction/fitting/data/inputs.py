@@ -376,8 +376,8 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        # Steps far above both that enclose them, which are alike, if all were equally long; across a
-        # gap any is possible.
+        # Steps, as if equally long, far above both that enclose them, which are alike; across a gap
+        # any is possible.
         step = np.diff(q, axis=0) * (recording.sample_time / np.diff(time))[:, None]
         step[gaps(time)] = np.nan
         before, at, after = step[:-2], step[1:-1], step[2:]
