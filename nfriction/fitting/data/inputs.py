@@ -265,7 +265,7 @@ def integration_substeps(
     """Integration steps per sample of at most `longest_step` [s]."""
     needed, most = required_substeps(plant, model, longest_step), options.max_substeps
     if needed > most:
-        logger.warning("friction needs %d substeps at rest, %d are used", needed, most)
+        logger.warning("near rest a sample needs %d integration steps, fits take %d", needed, most)
     # Twice the present need, as coefficients may grow during the search.
     return min(1 if needed == 1 else 2 * needed, most)
 
