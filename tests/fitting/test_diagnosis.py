@@ -495,9 +495,11 @@ def test_samples_missing_with_their_times_are_no_jump(missing):
     assert not any("jumps" in warning for warning in found)
 
 
-def test_a_fit_names_the_mistake_first():
+def test_a_fit_names_the_mistake_first(caplog):
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")
+    prepare_task(CVFM(1), plant, recording, FitOptions())
+    assert "the sign of joint1's position is reversed" in caplog.text
     found = fit(CVFM(1), plant, recording, method="equation_error")
     assert "the sign of joint1's position is reversed" in found.warnings[0]
     assert found.usability[0] == "do not use"

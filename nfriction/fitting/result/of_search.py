@@ -182,15 +182,13 @@ def offset_warnings(
     problem: ShootingProblem, vector: Tensor, intervals: Sequence[Interval]
 ) -> Iterator[str]:
     """A sentence for each drive with a larger constant torque than a sensor's usual bias."""
-    plant, terms = problem.plant_at(vector), {t.name: t for t in problem.variables.terms}
-    force = "N" if plant.unit == "m" else "N m"
+    plant, force = problem.plant_at(vector), "N" if problem.jacobian.plant.unit == "m" else "N m"
+    terms = {t.name: t for t in problem.variables.terms if "torque_offset" in t.change}
     for one in intervals:
-        change = terms[one.name].change if one.name in terms else {}
-        # Within the prior of the offset it is a bias like any other.
-        if "torque_offset" not in change or abs(one.value) <= terms[one.name].prior_sd:
-            continue
-        if one.low * one.high > 0:
-            j = int(change["torque_offset"].argmax())
+        term = terms.get(one.name)
+        # Within its prior an offset is a bias like any other.
+        if term and abs(one.value) > term.prior_sd and one.low * one.high > 0:
+            j = int(term.change["torque_offset"].argmax())
             whole = float(plant.torque_offset[j])
             way = "backwards" if whole > 0 else "forwards"
             yield (
