@@ -80,7 +80,7 @@ class Score(Errors):
     Attributes:
         limit: errors by an uncertain start or zero of the encoders and by noise of the torque, in
             simulations of this model; None where it was not asked for. The true model stays below
-            in 95 of 100 recordings; smaller differences between models are not meaningful.
+            in at least 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
