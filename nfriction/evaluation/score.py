@@ -66,6 +66,10 @@ class Errors:
     free_run: RMSE
     windows: dict[str, RMSE]
 
+    def __str__(self) -> str:
+        windows = (f"{horizon} s: {rmse.all:.3g}" for horizon, rmse in self.windows.items())
+        return ", ".join((f"free run: {self.free_run.all:.3g}", *windows))
+
     def to_dict(self) -> dict[str, Any]:
         return {
             "free_run": self.free_run.to_dict(),
@@ -95,6 +99,10 @@ class Score(Errors):
     simulated: Array = field(repr=False)
     diverged_at: float
     zero: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        limit = "" if self.limit is None else f"; limit of these data: {self.limit}"
+        return f"RMSE [rad; m] of {self.recording or 'a recording'}: {super().__str__()}{limit}"
 
     def to_dict(self) -> dict[str, Any]:
         return {

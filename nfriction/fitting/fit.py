@@ -7,8 +7,9 @@ A fit has two stages. *Equation error*: the smoothed motion implies the friction
 in which constant coefficients are linear, so regression finds them from any start, but biased by
 the noise of qdd. *Output error*: simulations from the start of short windows must follow the
 measured positions; this refines coefficients and plant without any derivative of the data. A
-strategy, one for each kind of coefficients (constant, neuro-fuzzy), says what is fitted in which
-order. The next step is `nfriction.fitting.shooting.problem`, the cost of the second stage.
+strategy, one for each kind of coefficients (`fitting.strategy`), says what is fitted in which
+order, from which start and over which windows. The next step is
+`nfriction.fitting.shooting.problem`, the cost of the second stage.
 """
 
 import pkgutil

@@ -73,10 +73,7 @@ def rk4_step(
 
 
 def simulate_eager(
-    plant: Plant,
-    friction: Friction,
-    inputs: RolloutInputs,
-    step_function: StepFunction = rk4_step,
+    plant: Plant, friction: Friction, inputs: RolloutInputs, step_function: StepFunction = rk4_step
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint).
 
