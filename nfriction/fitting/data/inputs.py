@@ -312,7 +312,19 @@ def data_warnings(
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    return (*_unlike_clocks(given, options), *_spikes(given, options), *still, *heavy)
+    of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *_finer_count(plant, given)
+    return (*of_logs, *still, *heavy)
+
+
+def _finer_count(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
+    """Positions that change by less than the rig's encoder count."""
+    seen = float(np.fmax.reduce([count_seen(r.q) for r in given], axis=None))
+    # The usual factors are at least 2: both edges of a pulse, quadrature, a gear.
+    if plant.position_quantum is not None and 1.5 * seen < plant.position_quantum:
+        yield (
+            f"Positions change by {seen:.3g} {plant.unit}, less than the `position_quantum` of "
+            f"{plant.position_quantum:.3g}; give one count as the joint moves, behind a gear."
+        )
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
