@@ -83,9 +83,9 @@ _OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ..
         re.compile(r'columns=\{("\w+": "[^"]+"(?:, "\w+": "[^"]+")*)\}'),
         lambda found: '--columns "' + found[1].replace('": "', "=").replace('", "', ",")[1:],
     ),
-    (re.compile(r"`degrees=True`"), "--degrees"),
+    (re.compile(r"`(columns|degrees)(=True)?`"), r"--\1"),
+    (re.compile(r'`encoder_reference="(\w+)"`'), r"--encoder-reference \1"),
     (re.compile(r"`fit_delay=True`(, or `recording\.advance_torque\([^)]+\)`)?"), "--fit-delay"),
-    (re.compile(r"`columns`"), "--columns"),
     (
         re.compile("create the model yourself and pass it as `into`"),
         "name its law, --law my.py:LAW",

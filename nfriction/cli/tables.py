@@ -6,7 +6,7 @@ from nfriction.cli.console import one_line
 from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
-from nfriction.evaluation.lead_in import LEAD_IN, ZERO_IN
+from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 
@@ -14,8 +14,9 @@ LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
     "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
     f"{LEAD_IN:g} s before, which are\nnot scored, or from a given one; error reduction: of the "
-    "free run, against no friction, simulated on\nthe rig as given; limit of these data: error "
-    "that noise of start and torque, and integration, may cause;\n=: within that of the least"
+    "free run, against no friction, simulated on\nthe rig as given; limit of these data: largest "
+    f"error in {DRAWS} simulations with the noise of start and\ntorque, or by the integration; "
+    "=: within that of the least"
 )
 
 

@@ -250,11 +250,7 @@ class Simulator:
         return np.where(self.quantum > 0, measured + unit * np.rint((q - measured) / unit), q)
 
     def simulate(
-        self,
-        states: Array,
-        samples: NDArray[np.intp],
-        noise: int | None = None,
-        finer: int = 1,
+        self, states: Array, samples: NDArray[np.intp], noise: int | None = None, finer: int = 1
     ) -> tuple[Array, Array]:
         """Positions (*batch, window, sample, joint), and when they diverged (*batch, window).
 
@@ -337,10 +333,7 @@ def with_own_zero(
 
 
 def estimate_zero(
-    plant: Plant,
-    friction: FrictionModel | None,
-    recording: Recording,
-    state: tuple[Array, Array],
+    plant: Plant, friction: FrictionModel | None, recording: Recording, state: tuple[Array, Array]
 ) -> Zero:
     """Zero of a recording's encoders.
 

@@ -66,6 +66,10 @@ class Errors:
     free_run: RMSE
     windows: dict[str, RMSE]
 
+    def __str__(self) -> str:
+        windows = (f"{horizon} s: {rmse.all:.3g}" for horizon, rmse in self.windows.items())
+        return ", ".join((f"free run: {self.free_run.all:.3g}", *windows))
+
     def to_dict(self) -> dict[str, Any]:
         return {
             "free_run": self.free_run.to_dict(),
@@ -80,7 +84,7 @@ class Score(Errors):
     Attributes:
         limit: errors by an uncertain start or zero of the encoders and by noise of the torque, in
             simulations of this model; None where it was not asked for. The true model stays below
-            in 95 of 100 recordings; smaller differences between models are not meaningful.
+            in at least 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
@@ -95,6 +99,10 @@ class Score(Errors):
     simulated: Array = field(repr=False)
     diverged_at: float
     zero: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        limit = "" if self.limit is None else f"; limit of these data: {self.limit}"
+        return f"RMSE [rad; m] of {self.recording or 'a recording'}: {super().__str__()}{limit}"
 
     def to_dict(self) -> dict[str, Any]:
         return {

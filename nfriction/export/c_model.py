@@ -14,12 +14,7 @@ from nfriction.codegen.graph import Program, trace
 from nfriction.codegen.scalar import Node, UnsupportedOperation, evaluate, reachable
 from nfriction.export.c_dialect import ControllerC, Real, comment, statements
 from nfriction.export.contract import ExportError
-from nfriction.export.controller import (
-    FILTER_STATE,
-    UNBOUNDED,
-    Controller,
-    for_single_precision,
-)
+from nfriction.export.controller import FILTER_STATE, UNBOUNDED, Controller, for_single_precision
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant
@@ -68,6 +63,7 @@ def source_of(
         "load": plant is not None
         and any(_depends(x, "load") for x in _traced_law(controller.model, 1).outputs[0].nodes),
         "bits": description["status_bits"],
+        "drive_torques": [] if plant is None else plant.torque_offset.tolist(),
         # Names and units are foreign text.
         "about": description,
         "safe": lambda text: comment(str(text)).rstrip(),
@@ -82,9 +78,8 @@ def source_of(
         f"/* Made by nfriction; do not edit. {name}.h says what it is. */\n"
         f'#include "{name}.h"\n\n#include <limits.h>\n#include <math.h>\n#include <string.h>\n'
     )
-    code = "\n".join([head, dialect.functions(body), body])
-    header = dialect.text("controller.h", **words)
-    code, header = (re.sub(r"\n{3,}", "\n\n", text) for text in (code, header))
+    texts = "\n".join([head, dialect.functions(body), body]), dialect.text("controller.h", **words)
+    code, header = (re.sub(r"\n{3,}", "\n\n", text) for text in texts)
     return code, header
 
 

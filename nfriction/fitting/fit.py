@@ -7,8 +7,9 @@ A fit has two stages. *Equation error*: the smoothed motion implies the friction
 in which constant coefficients are linear, so regression finds them from any start, but biased by
 the noise of qdd. *Output error*: simulations from the start of short windows must follow the
 measured positions; this refines coefficients and plant without any derivative of the data. A
-strategy, one for each kind of coefficients (constant, neuro-fuzzy), says what is fitted in which
-order. The next step is `nfriction.fitting.shooting.problem`, the cost of the second stage.
+strategy, one for each kind of coefficients (`fitting.strategy`), says what is fitted in which
+order, from which start and over which windows. The next step is
+`nfriction.fitting.shooting.problem`, the cost of the second stage.
 """
 
 import pkgutil
@@ -62,7 +63,8 @@ def fit(
             convention, by default the plant's.
         method: `"equation_error"` stops after the regression (constant coefficients only).
         windows: lengths of the shooting windows [s], in the order in which they are used.
-        fit_plant: adjust ratios of inertia and gravity terms, lengths and offsets, within bounds.
+        fit_plant: adjust inertia and gravity terms, lengths, encoder zeros, gear losses, torque
+            constants and a constant torque of each drive, within bounds.
         drag: also fit air drag on the links. None fits it to an undriven chain on a fixed pivot: a
             free swing loses as much to the air as to its joints, whose coefficients would absorb
             the drag.

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.paired_test import gains
-from nfriction.friction.hysteresis import (
-    DROP,
-    ELEMENTS,
-    FIRST,
-    OFFSET,
-    SATURATING,
-    VISCOUS,
-)
+from nfriction.friction.hysteresis import DROP, ELEMENTS, FIRST, OFFSET, SATURATING, VISCOUS
 from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]

@@ -148,10 +148,7 @@ class Rules:
 
 
 def fit_recorded(
-    schedule: Recorded,
-    joint: JointTorque,
-    blocks: Sequence[NDArray[np.intp]],
-    v_smooth: float,
+    schedule: Recorded, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
 ) -> MemoryFit:
     """Fit the law and set the rules that blocks left out gain by.
 

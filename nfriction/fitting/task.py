@@ -1,5 +1,6 @@
 """The checked arguments of a fit, which every strategy takes."""
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,10 +117,14 @@ def prepare_task(
     stated, mistakes = likely_mistakes(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
+    named = mistake_warning(stated, mistakes)
+    for sentence in named:
+        # A fit to such data may last minutes, and would say so only at its end.
+        logging.getLogger(__name__).warning(sentence)
     of = plant, advanced, moved, options
     unmodelled = () if mistakes else (*changing_friction(*of), *loose_loads(*of))
     found = (
-        *mistake_warning(stated, mistakes),
+        *named,
         *unmodelled,
         *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
@@ -131,16 +136,12 @@ def prepare_task(
     )  # fmt: skip
 
 
-def _zeroed_per_recording(
-    plant: Plant, recordings: Sequence[Recording], options: FitOptions
-) -> bool:
+def _zeroed_per_recording(plant: Plant, given: Sequence[Recording], options: FitOptions) -> bool:
     """True if encoders were set to zero at the start of each recording, or seem to have been."""
     if options.encoder_reference != "auto":
         return options.encoder_reference == "per_recording"
     # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
-    return options.method == "output_error" and looks_zeroed_per_recording(
-        plant, recordings, options
-    )
+    return options.method == "output_error" and looks_zeroed_per_recording(plant, given, options)
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:

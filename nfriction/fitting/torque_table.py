@@ -12,13 +12,7 @@ from torch import Tensor
 
 from nfriction.fitting.bristles import fit_bristles
 from nfriction.fitting.equation_error import TorqueBalance, regress
-from nfriction.fitting.hysteresis import (
-    LEAD_IN,
-    PATHS,
-    fit_slip,
-    path_of,
-    range_of,
-)
+from nfriction.fitting.hysteresis import LEAD_IN, PATHS, fit_slip, path_of, range_of
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.recorded import fit_recorded, recorded_inputs
 from nfriction.fitting.result.identifiability import (

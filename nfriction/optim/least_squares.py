@@ -24,7 +24,7 @@ MESSAGES: dict[str, str] = {
     "converged_gradient": "Converged: the gradient is zero to tolerance, or the residuals are.",
     "converged_cost": "Converged.",
     "converged_step": "Converged: the parameters no longer move.",
-    "max_steps": "The step limit was reached.",
+    "max_steps": "The step limit was reached; allow more steps.",
     "creeping": "Stalled before reaching a minimum (a kink or a narrow valley in the cost).",
     "stalled": "No step lowers the cost although the gradient is not small: gradient and cost "
     "disagree (a kink, noise or a wrong derivative).",

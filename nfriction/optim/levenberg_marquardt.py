@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on a local quadratic model, with bounds and an honest status.
+"""Levenberg-Marquardt on a local quadratic model, with bounds and the reason of its end.
 
 Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient g = J^T r and its
 Gauss-Newton Hessian H = J^T J. One iteration

@@ -174,10 +174,7 @@ def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
 
 
 def horizon_curve(
-    comparison: Comparison,
-    *,
-    part: Part | None = None,
-    column: str = "all",
+    comparison: Comparison, *, part: Part | None = None, column: str = "all"
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 

@@ -1,5 +1,6 @@
 """Friction torque over velocity, or position, with laws: of a motion, and of a table."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ Array = NDArray[np.float64]
 _POINTS = 3000  # that are drawn, a joint
 _BINS = 24  # of medians
 _DOT = Line2D([], [], linestyle="", marker=".", color=style.FAINT)
+_MEDIAN = Line2D([], [], linestyle="", marker="o", color=style.INK, markersize=2.2)
 _BAND = Patch(facecolor=style.FAINT, alpha=0.4)
 
 
@@ -50,6 +52,7 @@ def torque_over_velocity(
 
     Lines are at the load at rest and without acceleration, with 95 % bands; dots are
     `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
+    Medians of bins of velocity, with their quartiles, show the friction where dots scatter far.
 
     Args:
         plant: the mechanism, with its fitted terms where there are any.
@@ -73,11 +76,12 @@ def torque_over_velocity(
         grid = velocities(qd[:, k])
         lines = {name: _torque(model, grid, k) for name, model in models.items()}
         seen = np.flatnonzero(np.isfinite(torque[:, k]))
-        # Dots may scatter far beyond any friction; the laws and most dots set the limits.
-        most = np.quantile(torque[seen, k], [0.05, 0.95]) if len(seen) else np.zeros(0)
-        extremes = np.concatenate([*lines.values(), most])
+        binned = _binned(qd[seen, k], torque[seen, k])
+        # Dots may scatter far beyond any friction; the laws and the quartiles set the limits.
+        extremes = np.concatenate([*lines.values(), *binned[1:]])
         factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
         _dots(ax, qd[seen, k], factor * torque[seen, k])
+        _medians(ax, binned, factor)
         for name, line in lines.items():
             ax.plot(grid, factor * line, **looks[name].line)
             if name in known:
@@ -88,8 +92,8 @@ def torque_over_velocity(
         _name_axes(ax, plant.joint_names[k], plant.unit, unit)
         if k + columns >= plant.joints:
             ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
-    handles: list[Artist] = [_DOT, *(looks[name].handle for name in models)]
-    labels = ["from the motion", *models]
+    handles: list[Artist] = [_DOT, _MEDIAN, *(looks[name].handle for name in models)]
+    labels = ["from the motion", "median and quartiles", *models]
     if any(name in known for name in models):
         handles.append(_BAND)
         labels.append("95 % bands")
@@ -99,8 +103,7 @@ def torque_over_velocity(
 
 def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
     """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
-    size = max(1, round(DEFAULTS.diagnosis_block / step))
-    size = min(size, max(1, len(qd)))
+    size = max(1, min(round(DEFAULTS.diagnosis_block / step), len(qd)))
     whole = len(qd) // size * size
     speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
     one_way = torch.sign(speeds).mean(1).abs() == 1
@@ -166,7 +169,6 @@ def friction_curves(fits: "TorqueFits") -> Figure:
     figure, axes, _ = _panels(len(joints))
     looks = style.looks(fits.fits)
     shown: list[str] = []
-    bins = False
     for k, (joint, ax) in enumerate(zip(joints, axes, strict=True)):
         chosen = fits.chosen[joint.name]
         unlike = [
@@ -177,7 +179,6 @@ def friction_curves(fits: "TorqueFits") -> Figure:
         looped = _remembers(chosen)
         draw = _loops if looped else _curves
         unit = draw(ax, fits, k, [(name, looks[name].line) for name in (chosen, *others)])
-        bins = bins or not looped
         _name_axes(ax, f"{joint.name}: {plain_name(chosen)}", fits.table.unit, unit)
         ax.set_xlabel(f"position [{fits.table.unit}]" if looped
                       else f"velocity [{fits.table.unit}/s]")  # fmt: skip
@@ -186,10 +187,8 @@ def friction_curves(fits: "TorqueFits") -> Figure:
         "rows": _DOT,
         **{plain_name(name): looks[name].handle for name in names},
     }
-    if bins:
-        entries["median and quartiles"] = Line2D(
-            [], [], linestyle="", marker="o", color=style.INK, markersize=2.2
-        )
+    if not all(map(_remembers, fits.chosen.values())):
+        entries["median and quartiles"] = _MEDIAN
         entries["95 % of the law chosen"] = _BAND
     style.legend(figure, entries.values(), list(entries))
     return figure
@@ -222,8 +221,8 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
     joint = fits.table.joints[k]
     grid = velocities(joint.qd)
     found = {name: _steady(fits.fits[name][k], joint, grid) for name, _ in lines}
-    middle, low, median, high = _binned(joint)
-    extremes = np.concatenate([low, high, *(line for line, _ in found.values())])
+    binned = _binned(joint.qd, joint.tau)
+    extremes = np.concatenate([*binned[1:], *(line for line, _ in found.values())])
     factor, unit = style.scaled(fits.unit, extremes)
     _dots(ax, joint.qd, factor * joint.tau)
     for name, look in reversed(lines):
@@ -231,10 +230,7 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
         ax.plot(grid, factor * found[name][0], **look | {"linewidth": 1.8 if first else 0.8})
     look, (line, sd) = lines[0][1], found[lines[0][0]]
     _band(ax, grid, factor * line, factor * sd, look["color"])
-    ax.errorbar(
-        middle, factor * median, factor * np.stack([median - low, high - median]), fmt="o",
-        color=style.INK, markersize=2.2, elinewidth=0.6, zorder=3,
-    )  # fmt: skip
+    _medians(ax, binned, factor)
     ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.1))
     return unit
 
@@ -248,9 +244,21 @@ def _steady(found: "JointFit", joint: "JointTorque", qd: Array) -> tuple[Array, 
     return torque.numpy(), sd.numpy()
 
 
-def _binned(joint: "JointTorque") -> tuple[Array, Array, Array, Array]:
-    """Median velocity, and quartiles and median of the torque, in bins of equally many rows."""
-    bins = np.array_split(np.argsort(joint.qd), min(_BINS, len(joint)))
-    middle = np.array([np.median(joint.qd[rows]) for rows in bins])
-    low, median, high = np.array([np.quantile(joint.tau[b], [0.25, 0.5, 0.75]) for b in bins]).T
-    return middle, low, median, high
+def _binned(qd: Array, tau: Array) -> Array:
+    """Median velocity, quartile, median and quartile of the torque, in bins of about as many rows.
+
+    No bin holds both directions, whose frictions have opposite signs.
+    """
+    order = np.argsort(qd)
+    sides = [s for s in np.split(order, [np.searchsorted(qd[order], 0.0)]) if len(s)]
+    share = min(1.0, _BINS / max(1, len(qd)))
+    bins = [b for s in sides for b in np.array_split(s, math.ceil(share * len(s)))]
+    rows = [[np.median(qd[b]), *np.quantile(tau[b], [0.25, 0.5, 0.75])] for b in bins]
+    return np.array(rows).reshape(-1, 4).T
+
+
+def _medians(ax: Axes, binned: Array, factor: float) -> None:
+    x, low, median, high = binned
+    bars = factor * np.stack([median - low, high - median])
+    ax.errorbar(x, factor * median, bars, fmt="o", color=style.INK, markersize=2.2,
+                elinewidth=0.6, zorder=3)  # fmt: skip

@@ -106,7 +106,7 @@ def _check_values(key: str, values: Array) -> None:
         rule = f"within {LARGEST_VALUE:g}" if np.isfinite(value) else "finite"
         raise ValueError(
             f"`{label}` must be {rule}, got {value} at sample {sample} "
-            f"({len(bad)} such values in `{key}`); cut them off or drop those rows."
+            f"({len(bad)} in all); drop such rows with their times, a recording may lack samples."
         )
 
 

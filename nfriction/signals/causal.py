@@ -154,10 +154,7 @@ class SecondOrderLowPass:
 
 
 def causal_motion(
-    time: ArrayLike,
-    q: ArrayLike,
-    counts_per_revolution: float,
-    cutoff_hz: float = 20.0,
+    time: ArrayLike, q: ArrayLike, counts_per_revolution: float, cutoff_hz: float = 20.0
 ) -> Motion:
     """Motion from past and present samples alone, as in a controller.
 
@@ -187,11 +184,7 @@ def causal_motion(
 
 
 def frequency_counting(
-    time: ArrayLike,
-    q: ArrayLike,
-    counts_per_revolution: float,
-    *,
-    interval: float = 0.01,
+    time: ArrayLike, q: ArrayLike, counts_per_revolution: float, *, interval: float = 0.01
 ) -> Array:
     """Causal velocity from the counts within a fixed interval, poor at low speed.
 

@@ -16,13 +16,7 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen.rollout import SPEED_LIMIT
-from nfriction.simulation.protocols import (
-    Friction,
-    Plant,
-    RolloutInputs,
-    StepFunction,
-    as_stateful,
-)
+from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, StepFunction, as_stateful
 
 
 def acceleration(
@@ -79,10 +73,7 @@ def rk4_step(
 
 
 def simulate_eager(
-    plant: Plant,
-    friction: Friction,
-    inputs: RolloutInputs,
-    step_function: StepFunction = rk4_step,
+    plant: Plant, friction: Friction, inputs: RolloutInputs, step_function: StepFunction = rk4_step
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint).
 

@@ -114,6 +114,8 @@ def test_installed_command_fails_in_one_line() -> None:
 def test_advice_for_python_becomes_that_for_the_command_line() -> None:
     told = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
     assert one_line(told) == "torques are late (--fit-delay). Corrected"
+    assert one_line('not: `encoder_reference="shared"`') == "not: --encoder-reference shared"
+    assert one_line("`columns` or `degrees=True`") == "--columns or --degrees"
 
 
 def test_debug_shows_the_error_itself(bench: Path) -> None:

@@ -19,7 +19,7 @@ from nfriction.evaluation.lead_in import (
     estimate_zero,
     lead_in_samples,
 )
-from nfriction.evaluation.score import RMSE, Score
+from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
@@ -52,6 +52,17 @@ def test_the_true_model_is_as_good_as_the_encoder(convention):
 
 
 @pytest.mark.filterwarnings("ignore:.*has gaps")
+def test_a_score_is_printed_in_a_line():
+    errors = Errors(RMSE((0.0, 0.02), 0.0141421), {"1": RMSE((0.0, 0.01), 0.0070711)})
+    told = "free run: 0.0141, 1 s: 0.00707"
+    assert str(errors) == told
+    scored = Score(
+        errors.free_run, errors.windows, errors, "run3", np.zeros(1), np.zeros(1), np.inf
+    )
+    assert str(scored) == f"RMSE [rad; m] of run3: {told}; limit of these data: {told}"
+    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {told}"
+
+
 def test_simulations_start_anew_behind_a_gap():
     """The true model stays as good as the encoder, however long the recording paused."""
     whole = swing(plant(), MODEL, **SETTINGS)

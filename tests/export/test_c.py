@@ -577,3 +577,12 @@ def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_pat
            "-o", "s.o"], tmp_path)  # fmt: skip
     c(random_model("CVFM", joints), tmp_path / "even", info)
     assert "HAS_LOAD 0" in (tmp_path / "even" / "nfriction.h").read_text()
+
+
+def test_the_header_has_the_constant_torques_that_a_fit_gave_to_the_drives(tmp_path):
+    plant = rigs.multiarm_double()
+    offset = torch.tensor([0.0, -0.015], dtype=torch.float64)
+    for name, rig in (("with", plant.replace(torque_offset=offset)), ("without", plant)):
+        c(random_model("CVFM", 2), tmp_path, ModelInfo(rig=rig.to_dict()), name=name)
+    assert " *     0 -0.015 [N m]\n" in (tmp_path / "with.h").read_text()
+    assert "Not in tau" not in (tmp_path / "without.h").read_text()

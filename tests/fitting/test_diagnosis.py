@@ -487,9 +487,19 @@ def test_a_step_at_a_gap_is_no_spike():
     assert not any("jumps" in warning for warning in found)
 
 
-def test_a_fit_names_the_mistake_first():
+@pytest.mark.parametrize("missing", [1, 3])
+def test_samples_missing_with_their_times_are_no_jump(missing):
+    plant, q, tau = measured("wheel", count=COUNT / 50)
+    kept = np.r_[0:1000, 1000 + missing : len(q)]
+    found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
+    assert not any("jumps" in warning for warning in found)
+
+
+def test_a_fit_names_the_mistake_first(caplog):
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")
+    prepare_task(CVFM(1), plant, recording, FitOptions())
+    assert "the sign of joint1's position is reversed" in caplog.text
     found = fit(CVFM(1), plant, recording, method="equation_error")
     assert "the sign of joint1's position is reversed" in found.warnings[0]
     assert found.usability[0] == "do not use"

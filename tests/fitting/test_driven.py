@@ -78,6 +78,16 @@ def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
     )
 
 
+def test_friction_that_is_larger_one_way_is_named_as_a_constant_torque():
+    plant, one_way = geared(), [[0.0, 0.2, 0.01, 0.0, 1.0], [0.03, 0.15, 0.005, 0.0, 1.0]]
+    recordings = [driven(plant, NLFM(2, one_way, v_smooth=V_SMOOTH), seed) for seed in (0, 1)]
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
+    (warning,) = (w for w in found.warnings if "constant drive torque" in w)
+    assert "-0.03 N m at joint2" in warning
+    assert "0.06 N m larger forwards" in warning
+    assert "add 0.03 N m to a command" in warning
+
+
 def test_what_gears_lose_is_told_from_dry_friction():
     plant = geared()
     truth = plant.replace(gear_loss=torch.tensor([0.05, 0.12], dtype=F64))

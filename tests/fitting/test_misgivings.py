@@ -60,6 +60,14 @@ def test_joints_that_do_not_move_are_named(quantum):
     assert still.startswith("joint1 never moves")
 
 
+@pytest.mark.parametrize(("factor", "named"), [(1.0, False), (0.25, False), (4.0, True)])
+def test_a_count_larger_than_the_positions_show_is_named(factor, named):
+    recording = swing(pendulum(), MODEL, seconds=1.0)
+    told = said(pendulum(position_quantum=factor * COUNT), recording)
+    assert any("less than the `position_quantum` of 0.00307" in t for t in told) is named
+    assert len(told) == named
+
+
 def test_a_joint_that_moves_in_one_recording_is_not_named():
     plant, rest = resting(0)
     moving = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging")

@@ -43,6 +43,12 @@ def test_the_table_notes_what_is_at_a_bound_or_unknown(found: FitResult) -> None
     assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
 
 
+def test_the_table_notes_a_coefficient_that_no_fit_varies(found: FitResult) -> None:
+    table = replace(found, model=Stribeck(found.plant.joints), intervals=()).to_pandas()
+    assert set(table["note"][["delta" in name for name in table.index]]) == {"not fitted"}
+    assert not table["note"][["delta" not in name for name in table.index]].any()
+
+
 def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitResult) -> None:
     b = found.intervals[0].name
     good = replace(found, noise=found.residual, converged=True)

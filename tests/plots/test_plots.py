@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
@@ -226,7 +227,7 @@ def test_torque_of_the_motion_lies_on_the_law_that_made_it():
     figure = plots.torque_over_velocity(plant, {"LFM": law}, [recording], [motion])
     (ax,) = figure.axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("joint velocity [m/s]", "friction force [N]")
-    dots, line = ax.lines
+    dots, line = ax.lines[0], ax.lines[-1]
     velocity = torch.as_tensor(line.get_xdata())[:, None]
     expected = law(velocity, 0 * velocity, torch.ones_like(velocity)).detach()[:, 0]
     np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-12)
@@ -234,6 +235,18 @@ def test_torque_of_the_motion_lies_on_the_law_that_made_it():
     clear = np.abs(x) > 0.05  # away from the sign's passage, inside which a line has corners
     np.testing.assert_allclose(y[clear], np.interp(x, *line.get_data())[clear], rtol=1e-3)
     assert_tidy(figure)
+
+
+def test_medians_show_the_friction_where_noise_hides_it():
+    law = CVFM(1, [3.0, 5.0])
+    plant, recording, motion = axis_data(law)
+    noise = np.random.default_rng(1).normal(0, 30.0, recording.tau.shape)
+    noisy = recording._replace(tau=recording.tau + noise)
+    (ax,) = plots.torque_over_velocity(plant, {"CVFM": law}, [noisy], [motion]).axes
+    (bars,) = (c for c in ax.containers if isinstance(c, ErrorbarContainer))
+    x, y = bars.lines[0].get_data()
+    assert np.abs(y - np.interp(x, *ax.lines[-1].get_data())).mean() < 5.0
+    assert np.ptp(ax.get_ylim()) < np.ptp(ax.lines[0].get_ydata())
 
 
 def test_the_band_around_a_law_holds_what_its_parameters_leave_open():

@@ -169,6 +169,14 @@ def test_a_current_is_no_torque_and_not_left_out_without_a_word(name: str) -> No
         assert Recording.from_pandas(table).tau is None
 
 
+@pytest.mark.parametrize(("unit", "kind"), [("mA", "motor current"), ("Nm", "torque")])
+def test_a_unit_shows_what_drives_a_joint(tmp_path: Path, unit: str, kind: str) -> None:
+    rows = "".join(f"{k / 100};{k % 3 / 9};1\n" for k in range(20))
+    (tmp_path / "log.csv").write_text(f"time;q1;X\ns;rad;{unit}\n{rows}")
+    with pytest.warns(RecordingWarning, match=f"column X looks like {kind} and is not read"):
+        Recording.read(tmp_path / "log.csv")
+
+
 @pytest.mark.parametrize("columns", [{"q1": "q2"}, {"q1": "q1", "tau2": "q1"}, {"time": "q1:ms"}])
 def test_a_column_is_named_once(columns: dict[str, str]) -> None:
     table = swing().to_pandas().drop(columns="tau2", errors="ignore")
@@ -254,6 +262,8 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("time,q1,q3\n0,0,0\n", "column q2 is missing"),
         ("time,angle\n0,0\n", "column q1 is missing; found time, angle"),
         ("Zeit,Motorwinkel,Strom\n0,0,0\n", '"motor1": "Motorwinkel", "current1": "Strom"'),
+        ("Zeit;Motorwinkel;Iq\n[ms];[deg];[mA]\n0;0;0\n", '"current1": "Iq"'),
+        ("t_s,ang1,M1 (Nm)\n0,0,0\n", '"q1": "ang1", "tau1": "M1'),
         ("time,q1\n0,0\n1,zero\n", "column q1, row 1 .*got 'zero'"),
         ("time,q1\n0,0\n1,2,3\n", "ragged"),
         ("time,q1\n0,0,1\n1,2,3\n", "more cells than its header"),
@@ -332,7 +342,7 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
     [
         ({"q": np.zeros(60)}, r"`q` must be \(time, joint\), got shape \(60,\).*q\[:, None\]"),
         ({"q": [[0.0, 1.0], [2.0]]}, "`q` must be a rectangular array"),
-        ({"q": poked((60, 2), (7, 1), np.nan)}, "`q2` must be finite, got nan at sample 7"),
+        ({"q": poked((60, 2), (7, 1), np.nan)}, "`q2` must be finite, .* nan at sample 7 .*drop"),
         ({"tau": poked((60, 2), (9, 0), np.inf)}, "`tau1` must be finite, got inf at sample 9"),
         ({"tau": np.zeros((60, 1))}, r"`tau` must be shaped like `q` \(60, 2\)"),
         ({"qd": np.zeros((59, 2))}, "`qd` must be shaped like"),

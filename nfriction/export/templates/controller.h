@@ -6,6 +6,10 @@
 {% for coefficient in about.coefficients %}
  *     {{ safe(coefficient.name) }} [{{ safe(coefficient.unit) }}]
 {% endfor %}
+{% if drive_torques | select | list %}
+ * Not in tau: constant torques of the drives in the fitted plant, to subtract from a command:
+ *    {% for x in drive_torques %} {{ "%.3g" % x }}{% endfor %} [{{ safe(about.units.tau_f) }}]
+{% endif %}
  * Sample time: {{ "any" if about.sample_time is none else "%.9g s" % about.sample_time }}.
  * Joints, in order:
 {% for name in about.joint_names or range(1, joints + 1) %}

@@ -30,6 +30,7 @@ from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
+from nfriction.recording.validation import gaps
 from nfriction.signals import Motion, count_seen, kalman_smoother
 from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
@@ -264,7 +265,7 @@ def integration_substeps(
     """Integration steps per sample of at most `longest_step` [s]."""
     needed, most = required_substeps(plant, model, longest_step), options.max_substeps
     if needed > most:
-        logger.warning("friction needs %d substeps at rest, %d are used", needed, most)
+        logger.warning("near rest a sample needs %d integration steps, fits take %d", needed, most)
     # Twice the present need, as coefficients may grow during the search.
     return min(1 if needed == 1 else 2 * needed, most)
 
@@ -311,7 +312,19 @@ def data_warnings(
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    return (*_unlike_clocks(given, options), *_spikes(given, options), *still, *heavy)
+    of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *_finer_count(plant, given)
+    return (*of_logs, *still, *heavy)
+
+
+def _finer_count(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
+    """Positions that change by less than the rig's encoder count."""
+    seen = float(np.fmax.reduce([count_seen(r.q) for r in given], axis=None))
+    # The usual factors are at least 2: both edges of a pulse, quadrature, a gear.
+    if plant.position_quantum is not None and 1.5 * seen < plant.position_quantum:
+        yield (
+            f"Positions change by {seen:.3g} {plant.unit}, less than the `position_quantum` of "
+            f"{plant.position_quantum:.3g}; give one count as the joint moves, behind a gear."
+        )
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
@@ -375,11 +388,13 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        # Steps far above both that enclose them, which are alike; across a gap any is possible.
-        step = np.diff(q, axis=0)
+        # Steps, as if equally long, far above both that enclose them, which are alike; across a gap
+        # any is possible.
+        step = np.diff(q, axis=0) * (recording.sample_time / np.diff(time))[:, None]
+        step[gaps(time)] = np.nan
         before, at, after = step[:-2], step[1:-1], step[2:]
         height = np.minimum(np.abs(at - before), np.abs(at - after))
-        height[(2 * np.abs(after - before) > height) | _gaps(recording)[1:-1, None]] = 0.0
+        height = np.where(2 * np.abs(after - before) <= height, height, 0.0)
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
         columns = zip(recording.names, far.T, lasting.T, height.T, strict=True)
         for name, peak, jump, high in columns:
@@ -400,14 +415,6 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
             yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
-
-
-def _gaps(recording: Recording) -> NDArray[np.bool_]:
-    """True for steps that lie in no segment, (step,)."""
-    gap = np.ones(len(recording) - 1, dtype=bool)
-    for first, last in recording.segments:
-        gap[first:last] = False
-    return gap
 
 
 def _times(found: Array) -> str:

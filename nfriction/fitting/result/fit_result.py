@@ -264,10 +264,12 @@ class FitResult:
         rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
         table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
         unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
-        table["note"] = [
-            "not identifiable" if name in unknown else "at a bound" * (name in self.at_bounds)
-            for name in rows
-        ]
+        notes = dict.fromkeys(rows, "") | dict.fromkeys(self.at_bounds, "at a bound")
+        names = zip(schedule.coefficient_names, schedule.fitted_mask, strict=True)
+        kept = [name for name, fitted in names if not fitted]
+        notes |= {name: "not fitted" for name in rows if name.split(" of ")[0] in kept}
+        notes |= dict.fromkeys(unknown, "not identifiable")
+        table["note"] = [notes[name] for name in rows]
         return table.rename_axis("parameter")
 
     def _head(self) -> str:

@@ -201,11 +201,7 @@ def warnings_of(
 
 
 def model_error_warning(
-    residual: float,
-    effective_sd: float,
-    noise: float,
-    unit: str,
-    options: FitOptions = DEFAULTS,
+    residual: float, effective_sd: float, noise: float, unit: str, options: FitOptions = DEFAULTS
 ) -> tuple[str, ...]:
     """A warning if the residual exceeds what the measurement noise [rad; m] explains."""
     if not residual > options.model_error_ratio * noise:

@@ -23,11 +23,7 @@ from nfriction.fitting.result.identifiability import (
     weakly_identified,
 )
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
-from nfriction.fitting.shooting.autocorrelation import (
-    bandwidth,
-    effective_noise,
-    hac_sd,
-)
+from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.uncertainty import (
     encoder_count,
@@ -158,6 +154,7 @@ def result_from_shooting(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scale_warning(problem, intervals)
+        + tuple(offset_warnings(problem, vector, intervals))
         + outlier_warning(outliers),
         outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
@@ -179,6 +176,27 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
         f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
         "friction is, too.",
     )
+
+
+def offset_warnings(
+    problem: ShootingProblem, vector: Tensor, intervals: Sequence[Interval]
+) -> Iterator[str]:
+    """A sentence for each drive with a larger constant torque than a sensor's usual bias."""
+    plant, force = problem.plant_at(vector), "N" if problem.jacobian.plant.unit == "m" else "N m"
+    terms = {t.name: t for t in problem.variables.terms if "torque_offset" in t.change}
+    for one in intervals:
+        term = terms.get(one.name)
+        # Within its prior an offset is a bias like any other.
+        if term and abs(one.value) > term.prior_sd and one.low * one.high > 0:
+            j = int(term.change["torque_offset"].argmax())
+            whole = float(plant.torque_offset[j])
+            way = "backwards" if whole > 0 else "forwards"
+            yield (
+                f"The fitted plant has a constant drive torque of {whole:.3g} {force} at "
+                f"{plant.joint_names[j]}, which may as well be friction that is "
+                f"{2 * abs(whole):.3g} {force} larger {way}. The friction model and its exports "
+                f"lack it: add {-whole:.3g} {force} to a command."
+            )
 
 
 def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:

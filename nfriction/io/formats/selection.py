@@ -27,7 +27,7 @@ _LIKE_TORQUE = re.compile(
     r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
-_LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)\b", re.IGNORECASE)
+_LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)(?![a-z])", re.IGNORECASE)
 _LIKE_POSITION = re.compile(
     r"^(pos|ang|winkel|gelenk|joint|motor|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
@@ -322,12 +322,14 @@ def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> li
     if 0 < len(free) < joints:
         finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
         remarks.append((finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'))
-    unread = _unread_torques(table, sources) if free else []
+    read = {source.column for source in sources.values()}
+    drives = {name: kind for name, kind in _drives(table).items() if name not in read}
+    unread = [name for name in drives if f"tau{_number(name)}" not in sources] if free else []
     if unread:
         own = f"tau{_number(unread[0])}"
         option = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
         kind, remedy = "torque", f"if it is, name it with {option}"
-        if _LIKE_CURRENT.search(unread[0]):
+        if drives[unread[0]] == "current":
             kind, option = "motor current", option.replace('{"tau', '{"current')
             remedy = "if it drives a joint, give the rig a `motor` with its `torque_constant` "
             remedy += f"and `gear_ratio`, and name the column with {option}"
@@ -336,15 +338,16 @@ def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> li
     return remarks
 
 
-def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
-    """Columns that look like torque of joints that have none yet."""
-    read = {source.column for source in sources.values()}
-    names = [str(name) for name in table.attrs.get("found", table.columns)]
-    return [
-        name
-        for name in names
-        if name not in read and _LIKE_TORQUE.search(name) and f"tau{_number(name)}" not in sources
-    ]
+def _drives(table: pd.DataFrame) -> dict[str, str]:
+    """Columns that look by name or unit like torque or a motor's current, and as which of both."""
+    units, found = _texts(table, "units"), {}
+    for name in map(str, table.attrs.get("found", table.columns)):
+        of_unit = [kind for kind in ("tau", "current") if _per_si(kind, units.get(name, ""))]
+        if of_unit:
+            found[name] = of_unit[0]
+        elif _LIKE_TORQUE.search(name):
+            found[name] = "current" if _LIKE_CURRENT.search(name) else "tau"
+    return found
 
 
 def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
@@ -367,7 +370,7 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
     lost = [columns.get(key, key) for key in missing[:10]]
     label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
-    guessed = {} if columns else _guessed(found)
+    guessed = {} if columns else _guessed(found, _drives(table))
     pairs = ", ".join(f'"{key}": "{name}"' for key, name in guessed.items())
     pairs = pairs or f'"{missing[0]}": "..."'
     return (
@@ -376,14 +379,14 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     )
 
 
-def _guessed(found: Sequence[str]) -> dict[str, str]:
+def _guessed(found: Sequence[str], drives: Mapping[str, str]) -> dict[str, str]:
     """Our names with a file's, by usual words; empty unless time and positions are among them.
 
     For an error's advice only: what is read is always named by the user.
     """
     plain = [name for name in found if not set(name) & set('",=:') and len(name) <= 60]
     times = [name for name in plain if _LIKE_TIME.search(name)]
-    torques = [name for name in plain if _LIKE_TORQUE.search(name)]
+    torques = [name for name in plain if name in drives]
     positions = [name for name in plain if _LIKE_POSITION.search(name) and name not in torques][:10]
     if len(times) != 1 or not positions:
         return {}
@@ -394,10 +397,7 @@ def _guessed(found: Sequence[str]) -> dict[str, str]:
     }
     # Fewer than joints: it is not known which are driven.
     if len(torques) == len(positions):
-        pairs |= {
-            f"{'current' if _LIKE_CURRENT.search(name) else 'tau'}{k}": name
-            for k, name in enumerate(torques, 1)
-        }
+        pairs |= {f"{drives[name]}{k}": name for k, name in enumerate(torques, 1)}
     return {key: name for key, name in pairs.items() if key != name}
 
 
