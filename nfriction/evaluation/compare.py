@@ -16,6 +16,7 @@ from nfriction.fitting.data.inputs import as_model, require_drive, warn_of_undri
 from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
+from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -451,9 +452,10 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
 
 def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:
     """Coefficients by where they apply and by name, a value a joint."""
-    names = model.schedule.coefficient_names
+    # All but the heat itself, of which a motion has none at its start.
+    shown = [(k, c.name) for k, c in enumerate(model.law.coefficients) if c != HEAT]
     return {
-        label: {name: values[:, k].tolist() for k, name in enumerate(names)}
+        label: {name: values[:, k].tolist() for k, name in shown}
         for label, values in model.schedule.coefficient_sets().items()
     }
 

@@ -429,4 +429,5 @@ def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Ten
     # On a light mechanism most of the torque is an error of inertia terms and smoothing.
     explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()
     explained = torch.maximum(explained, options.min_explained * torque.torque)
-    return explained.clamp_min(1e-9)[:, None] * shares
+    plain = torch.tensor([c.unit == "-" for c in law.coefficients])
+    return torch.where(plain, 1.0, explained.clamp_min(1e-9)[:, None]) * shares

@@ -103,8 +103,12 @@ class Schedule(nn.Module, ABC):
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Hidden state after every sample of a motion (sample, joint): (sample, joint, state)."""
-        # One by one, as each state needs the one before; a subclass may know a closed form.
-        rows = [self.initial_state(qd[0], qdd[0])]
+        return self.states_from(self.initial_state(qd[0], qdd[0]), qd, qdd)
+
+    def states_from(self, first: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The same with the state after the first sample given, (*batch, joint, state)."""
+        # One by one, as each state needs the one before; a subclass may know a faster way.
+        rows = [first]
         for v, a in zip(qd[1:], qdd[1:], strict=True):
             rows.append(self.advance(v, a, rows[-1]))
         return torch.stack(rows)

@@ -1,4 +1,4 @@
-"""Laws whose friction depends on more than the speed: on the direction of turning, on the load."""
+"""Laws whose friction depends on more than the speed: on direction, load and heat."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -7,6 +7,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.heat import FALL, HEAT
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 
 # A coefficient for each input, behind the law's own.
@@ -14,11 +15,16 @@ INPUTS = {
     # Friction that is larger in one direction than in the other; it vanishes at rest.
     "direction": Coefficient("F_t", "N m", positive=False, prior_scale=1.0),
     "load": Coefficient("F_n", "N m", prior_scale=1.0),
+    # Friction that falls with the heat of the joint, whose last coefficient is that heat.
+    "heat": FALL,
 }
 
 
 def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
-    """A law with further inputs: `f + F_t sgn(qd)^2` by direction, `f + F_n load sgn(qd)` by load.
+    """A law with further inputs.
+
+    `f + F_t sgn(qd)^2` by direction, `f + F_n load sgn(qd)` by load; `exp(-k_h h)` times all of it
+    by the heat h, which is a hidden state of the coefficients (`nfriction.friction.heat`).
 
     Raises:
         ValueError: for an input that does not exist or is repeated.
@@ -29,7 +35,7 @@ def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
         raise ValueError(f"`inputs` must be different ones of {', '.join(INPUTS)}, got {inputs!r}.")
     if not chosen:
         return law
-    own = (*law.coefficients, *(INPUTS[name] for name in chosen))
+    own = (*law.coefficients, *(INPUTS[name] for name in chosen), *(HEAT,) * ("heat" in chosen))
     torque = _torque_with_inputs(law.torque, len(law.names), chosen)
     return Law(f"{law.name}_by_{'_'.join(chosen)}", own, torque)
 
@@ -45,11 +51,12 @@ class _WithInputs(nn.Module):
     own: Final[int]
     turns: Final[bool]
     loaded: Final[bool]
+    heated: Final[bool]
 
     def __init__(self, torque: TorqueFunction, own: int, inputs: tuple[str, ...]) -> None:
         super().__init__()
         self.torque, self.own, self.given = torque, own, inputs
-        self.turns, self.loaded = "direction" in inputs, "load" in inputs
+        self.turns, self.loaded, self.heated = (name in inputs for name in INPUTS)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _torque_with_inputs, (self.torque, self.own, self.given)
@@ -60,8 +67,15 @@ class _WithInputs(nn.Module):
         if self.turns:
             tau_f = tau_f + coefficients.select(-1, self.own) * sign * sign
         if self.loaded:
-            tau_f = tau_f + coefficients.select(-1, -1) * load * sign
+            tau_f = tau_f + coefficients.select(-1, self.own + int(self.turns)) * load * sign
+        if self.heated:
+            tau_f = tau_f * torch.exp(-coefficients.select(-1, -2) * coefficients.select(-1, -1))
         return tau_f
+
+
+def is_heated(law: Law) -> bool:
+    """True of a law with the input `"heat"`, whose coefficients have a hidden state."""
+    return isinstance(law.torque, _WithInputs) and law.torque.heated
 
 
 def require_bearing_loads(law: Law, plant: object) -> None:

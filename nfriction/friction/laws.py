@@ -46,8 +46,10 @@ class Coefficient:
         initial_grid: start values to try where the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
         prior_scale: standard deviation of a prior around zero, relative to the RMS of the joint's
-            friction torque; infinite for none. Meant for effects that are small in most joints.
-        stores: scales the energy of a law's memory, so that networks leave it constant.
+            friction torque, or itself where the coefficient has no unit; infinite for none. Meant
+            for effects that are small in most joints.
+        stores: belongs to a hidden state, such as the energy of a law's memory or a joint's heat,
+            so that networks leave it constant.
 
     Raises:
         ValueError: if a nonlinear coefficient has no initial grid, or has a prior, or a start value

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
-from nfriction.friction.inputs import with_inputs
+from nfriction.friction.heat import Heated
+from nfriction.friction.inputs import is_heated, with_inputs
 from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number, require_options
@@ -436,6 +437,13 @@ class NeuroFuzzy(Schedule):
         return ", ".join(f"{name}={value!r}" for name, value in self.options().items())
 
 
+class HeatedNeuroFuzzy(Heated, NeuroFuzzy):
+    """Neuro-fuzzy coefficients of a law with heat."""
+
+    # TorchScript does not inherit that these are final.
+    __constants__ = ("roundness", "reach", "turn")
+
+
 # Coefficients by networks, as model files name them. The papers' own are resolved by name, because
 # the core does not import them.
 NETWORKS = {
@@ -451,8 +459,8 @@ class NeuroFuzzyModel(NamedModel):
         joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
         inputs: what friction depends on besides speed and acceleration: `"direction"` of turning,
-            `"load"` of the bearing, each by a coefficient of its own (`with_inputs`); None
-            lets a fit choose those that pay.
+            `"load"` of the bearing, `"heat"` of the joint, each by a coefficient of its own
+            (`with_inputs`); None lets a fit choose those that pay.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 
@@ -484,6 +492,10 @@ class NeuroFuzzyModel(NamedModel):
             raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
         made: Callable[..., Schedule] = resolve_name(NETWORKS[network])
         require_options(f"network {network!r}", made, options, ("network", "inputs"))
+        if is_heated(args[0]):
+            if made is not NeuroFuzzy:
+                raise ValueError(f'the input "heat" needs `network="anfis"`, got {network!r}.')
+            made = HeatedNeuroFuzzy
         return made(*args, **options)
 
 

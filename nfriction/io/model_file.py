@@ -346,8 +346,10 @@ def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     qd, qdd, load = (x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
         coefficients = trial.coefficients(qd, qdd)
-        torque = trial.steady_torque(qd, load, coefficients)
-    if not (coefficients.isfinite().all() and torque.isfinite().all()):
+        found = [coefficients, trial.steady_torque(qd, load, coefficients)]
+        if trial.state_size:
+            found.append(trial.advance(qd, qdd, trial.initial_state(qd, qdd)))
+    if not all(x.isfinite().all() for x in found):
         raise ValueError("with its parameters the model gives no finite torque.")
 
 

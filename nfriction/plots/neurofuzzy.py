@@ -319,8 +319,8 @@ def coefficient_sections(
 
 
 def _fitted(model: FrictionModel) -> list[tuple[int, Coefficient]]:
-    """Coefficients that are fitted, with their places; the others are the same everywhere."""
-    return [(k, c) for k, c in enumerate(model.law.coefficients) if c.fitted]
+    """Coefficients that networks fit, with their places; the others are the same everywhere."""
+    return [(k, c) for k, c in enumerate(model.law.coefficients) if c.fitted and not c.stores]
 
 
 def _edges(rules: FuzzyRules, joint: int) -> Edges:

@@ -13,14 +13,15 @@ from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.inputs import (
     _Choice,
-    _of_errors,
+    _of_shared,
     candidates,
     chosen_inputs,
-    contiguous_blocks,
     drives,
+    widened_start,
 )
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
+from nfriction.friction.heat import HeatedConstant
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
@@ -35,13 +36,19 @@ TRUTHS = {
     "nothing": ([], [[5e-3, 1e-3], [2e-3, 5e-4]]),
     "direction": (["direction"], [[5e-3, 1e-3, 2e-3], [2e-3, 5e-4, -1e-3]]),
     "load": (["load"], [[1e-3, 1e-3, 4e-3], [5e-4, 5e-4, 2e-3]]),
+    "heat": (["heat"], [[5e-3, 1e-3, 1.5, 0.0], [2e-3, 5e-4, 1.0, 0.0]]),
 }
+CAPACITY, COOLING = [0.1, 0.05], 2.0
 
 
 def truth(name: str) -> FrictionModel:
     inputs, values = TRUTHS[name]
     law = with_inputs(COULOMB_VISCOUS, inputs)
-    return FrictionModel(law, Constant(law, 2, values), V_SMOOTH).requires_grad_(False)
+    schedule = Constant(law, 2, values)
+    if name == "heat":
+        schedule = HeatedConstant(law, 2, values)
+        schedule.set_heat(CAPACITY, COOLING, 2e-3)
+    return FrictionModel(law, schedule, V_SMOOTH).requires_grad_(False)
 
 
 @pytest.fixture(scope="module", params=TRUTHS)
@@ -61,6 +68,26 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         assert found[0].name == name
         assert found[0].share > 0.5
         assert "unexplained" in found[0].words(("a", "b"))
+
+
+def test_the_fall_by_heat_is_recovered() -> None:
+    brief, true = {**BRIEF, "windows": (0.5, 1.0)}, truth("heat")
+    recording = swing(pendulum(), true, seconds=6.0)
+    law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **brief)
+    model = NFCVFM(2, v_smooth=V_SMOOTH)
+    task = prepare_task(model, pendulum(), [recording], FitOptions(**brief))
+    found = widened_start(task, law, ["heat"])
+    (motion,) = task.motions
+    qd, qdd = torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd)
+    # Heat has no unit of its own: its capacity and the coefficient k_h scale each other.
+    expected, fall = (
+        m.coefficients_from(qd, qdd, m.schedule.states(qd, qdd))[..., -2:].prod(-1)
+        for m in (true, found.model)
+    )
+    assert expected.amax() > 0.6
+    torch.testing.assert_close(fall, expected, rtol=0, atol=0.05)
+    assert found.model.schedule.cooling_time == pytest.approx(COOLING, rel=0.5)
+    assert found.residual < 0.1 * law.residual
 
 
 ONE = torch.ones(6, dtype=torch.float64)
@@ -151,34 +178,40 @@ def test_inputs_that_are_given_stay(recorded) -> None:
     assert not fit(model, pendulum(), recording, max_steps=2, **BRIEF).inputs
 
 
-def test_what_is_not_fitted_does_not_move() -> None:
-    one, zero = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    block = Quadratic(10.0, torch.tensor([-2.0, -2.0]).double(), one)
-    held = (torch.tensor([0.0, -9.0]).double(), torch.tensor([0.0, 9.0]).double())
-    choice = _Choice([block, block], Quadratic(0.0, zero, 0 * one), held, {})
-    torch.testing.assert_close(choice.left_out([]), torch.tensor([8.0, 8.0]).double())
+def choice_of(gradient: list[float], hessian: torch.Tensor, lower: float = -9.0) -> _Choice:
+    """A candidate, the second variable, beside one that the law has; a prior of one unit."""
+    bounds = torch.tensor([0.0, lower]).double(), torch.tensor([0.0, 9.0]).double()
+    local = Quadratic(torch.tensor(20.0).double(), torch.tensor(gradient).double(), hessian)
+    return _Choice(local, torch.ones(2).double(), bounds, {"load": [1]})
 
 
-def test_a_block_costs_what_its_errors_do_with_the_states_at_their_best() -> None:
-    # Errors (2 x + s - 1)^2 / 2 + s^2 / 2 beside a prior 3 (x + 2)^2 / 2 of x = 0, and s = 1.
-    hessian = torch.tensor([[7.0, 2.0], [2.0, 2.0]]).double()
-    local = Quadratic(torch.tensor(6.5).double(), torch.tensor([6.0, 1.0]).double(), hessian)
-    three, six = torch.tensor([[3.0]]).double(), torch.tensor([6.0]).double()
-    found = _of_errors(local, Quadratic(6.0, six, three))
+def test_evidence_is_the_integral_over_the_coefficient() -> None:
+    # Cost 20 - 6 x + 4 x^2 / 2, of which x^2 / 2 is the prior.
+    choice = choice_of([-2.0, -6.0], torch.diag(torch.tensor([1.0, 4.0])).double())
+    x = torch.linspace(-9.0, 9.0, 20001, dtype=torch.float64)
+    density = torch.exp(6.0 * x - 2.0 * x**2) / (2.0 * torch.pi) ** 0.5
+    expected = float(torch.trapezoid(density, x).log())
+    gained = choice.evidence([1])[0] - choice.evidence([])[0]
+    assert gained == pytest.approx(expected, rel=1e-9)
+    assert choice.evidence([1])[1] == pytest.approx(20.0 - 4.5)
+    (gain,) = choice.forward(1.0)
+    assert gain.share == pytest.approx(4.5 / 20.0)
+
+
+def test_an_input_that_its_sign_forbids_has_no_evidence() -> None:
+    choice = choice_of([0.0, 6.0], torch.diag(torch.tensor([1.0, 4.0])).double(), lower=0.0)
+    assert choice.evidence([1])[0] < choice.evidence([])[0]
+    assert not choice.forward(0.0)
+
+
+def test_window_states_are_at_their_best() -> None:
+    # (2 x + s - 1)^2 / 2 + s^2 / 2 at x = 0 and s = 1, which is least at s = 1 / 2 - x.
+    hessian = torch.tensor([[4.0, 2.0], [2.0, 2.0]]).double()
+    found = _of_shared(Quadratic(torch.tensor(0.5).double(), torch.tensor([0.0, 1.0]).double(),
+                                 hessian), 1)  # fmt: skip
     assert float(found.cost) == 0.25
     torch.testing.assert_close(found.gradient, torch.tensor([-1.0]).double())
     torch.testing.assert_close(found.hessian, torch.tensor([[2.0]]).double())
-
-
-def test_blocks_are_contiguous_and_share_out_each_recording() -> None:
-    class Spans:
-        spans = ((0, 0, 9), (0, 9, 18), (0, 18, 27), (0, 27, 36), (1, 0, 9))
-
-        def __len__(self) -> int:
-            return 5
-
-    blocks = contiguous_blocks(Spans(), 3)
-    assert [b.nonzero().flatten().tolist() for b in blocks] == [[0, 1], [2], [3], [4]]
 
 
 @pytest.mark.parametrize(
@@ -201,7 +234,7 @@ def test_the_load_of_a_motor_is_no_candidate() -> None:
     time = torch.arange(300).double().numpy() * 2e-3
     recording = Recording(time, 0.1 * np.sin(9.0 * time)[:, None])
     task = prepare_task(NFCVFM(1), rotor, [recording], FitOptions(**BRIEF))
-    assert candidates(task) == ("direction",)
+    assert candidates(task) == ("direction", "heat")
 
 
 def test_a_friction_of_the_load_is_simulated_with_the_loads_it_was_fitted_to(tmp_path) -> None:

@@ -72,7 +72,7 @@ def test_derivatives_follow_the_deflections_from_a_windows_start(
     recording = Recording(run.time.numpy(), run.q.numpy() + 1e-3, unit=plant.unit)
     windows = cut_windows([recording], [kalman_smoother(recording.time, recording.q)], 0.1)
     problem = ShootingProblem(
-        StepJacobian(plant, model, []), model, windows.deflected(plant, model), 1e-3,
+        StepJacobian(plant, model, []), model, windows.with_states(plant, model), 1e-3,
         torch.eye(joints, dtype=F64),
     )  # fmt: skip
     x = problem.variables.start()
@@ -100,7 +100,7 @@ def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
     tau = np.concatenate([force, force[-1:]])
     recording = Recording(run.time.numpy(), run.q.numpy(), tau=tau, unit="m")
     windows = cut_windows([recording], [kalman_smoother(recording.time, recording.q)], 0.2)
-    share = windows.deflected(AXIS, model).law_state
+    share = windows.with_states(AXIS, model).law_state
     assert share is not None
     largest = sum(SOFT[:2]) / SOFT[3]
     true = run.law_state[[first for _, first, _ in windows.spans]] / largest

@@ -58,3 +58,16 @@ def named_models(joints: int = 3) -> dict[str, FrictionModel]:
     for seed, model in enumerate(models.values()):
         randomise(model, 0.3, seed)
     return models
+
+
+def warming_network() -> FrictionModel:
+    """A neuro-fuzzy model of friction that falls with heat, off its start as a fit moves it."""
+    model = model_by_name("NFCVFM")(
+        2, [0.1, 0.2, 0.5, 0.0], inputs=["heat"], terms=(3, 2), head_units=2
+    )
+    # Not the coefficients of heat, which networks leave as they are.
+    lower, upper = model.schedule.bounds()
+    moved = torch.where(lower < upper, 0.1 * normal(len(lower)), 0.0)
+    model.schedule.set_parameter_vector(moved)
+    model.schedule.set_heat([3.0, 4.0], 2.0, 2e-3)
+    return model.requires_grad_(False)

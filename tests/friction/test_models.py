@@ -167,7 +167,10 @@ def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None
     [
         ({"network": "rbf", "terms": (3, 3)}, "network 'rbf' has no option terms; it has"),
         ({"head_units": 2.5}, "`head_units` must be a whole number"),
-        ({"inputs": "load"}, "`inputs` must be different ones of direction, load, got 'load'"),
+        (
+            {"inputs": "load"},
+            "`inputs` must be different ones of direction, load, heat, got 'load'",
+        ),
     ],
 )
 def test_wrong_options_of_a_network_are_named(given, words) -> None:

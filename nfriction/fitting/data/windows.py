@@ -13,6 +13,7 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+from nfriction.simulation.protocols import Rollout
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Windows:
         recordings, motions: that the windows are of, in joint coordinates.
         law_state: of a law with memory at the start of each window, over that of a contact that
             slips slowly, (window, joint, state).
+        hidden_state: of the coefficients at the start of each window, (window, joint, state).
     """
 
     q: Tensor
@@ -43,6 +45,7 @@ class Windows:
     recordings: tuple[Recording, ...] = ()
     motions: tuple[Motion, ...] = ()
     law_state: Tensor | None = None
+    hidden_state: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -61,18 +64,40 @@ class Windows:
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
             law_state=None if self.law_state is None else self.law_state[index],
+            hidden_state=None if self.hidden_state is None else self.hidden_state[index],
         )  # fmt: skip
 
-    def deflected(self, plant: Plant, model: FrictionModel) -> "Windows":
-        """The windows with deflections of a law with memory that balance the torques.
+    def with_states(self, plant: Plant, model: FrictionModel) -> "Windows":
+        """The windows with the state of the friction at the start of each.
 
-        The motion before would show them only where it is known to a fraction of the displacement
-        over which contacts yield.
+        A hidden state of the coefficients is what the motion before leaves. Deflections of a law
+        with memory are those that balance the torques: the motion before would show them only where
+        it is known to a fraction of the displacement over which contacts yield.
         """
-        qdd = [torch.as_tensor(self.motions[place].qdd)[first] for place, first, _ in self.spans]
-        found = self.tau[:, 0] - plant.inverse_dynamics(self.q0, self.qd0, torch.stack(qdd))
-        share, slipping = holding_share(model, found)
-        return replace(self, law_state=share[..., None].expand(-1, -1, slipping.shape[-1]))
+        motions = [[torch.as_tensor(x) for x in (m.qd, m.qdd)] for m in self.motions]
+        hidden = law_state = None
+        if model.state_size:
+            along = [model.schedule.states(*motion) for motion in motions]
+            hidden = torch.stack([along[place][first] for place, first, _ in self.spans])
+        if model.law.memory:
+            qdd = torch.stack([motions[place][1][first] for place, first, _ in self.spans])
+            found = self.tau[:, 0] - plant.inverse_dynamics(self.q0, self.qd0, qdd)
+            share, slipping = holding_share(model, found)
+            law_state = share[..., None].expand(-1, -1, slipping.shape[-1])
+        return replace(self, hidden_state=hidden, law_state=law_state)
+
+    @torch.no_grad()
+    def states_along(self, model: FrictionModel, motion: Rollout) -> Tensor | None:
+        """Hidden state of the coefficients at every step, (window, step + 1, joint, state).
+
+        Along a motion from the windows' starts; None without such a state.
+        """
+        if not model.state_size:
+            return None
+        qd, qdd = motion.qd.transpose(0, 1), motion.qdd.transpose(0, 1)
+        first = self.hidden_state
+        first = model.initial_state(qd[0], qdd[0]) if first is None else first
+        return model.schedule.states_from(first, qd, qdd).transpose(0, 1)
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
         """Torque that was recorded `delay` [s] later, and its slope over the delay.

@@ -17,6 +17,7 @@ from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
 from nfriction.friction import both_names
+from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -36,7 +37,7 @@ UNIFORM_TURN = math.pi / 3**0.5
 
 @dataclass(frozen=True)
 class InputGain:
-    """Share of the squared error of blocks left out that an input explains.
+    """Share of the squared error that an input explains.
 
     Attributes:
         name: of the input.
@@ -55,7 +56,7 @@ class InputGain:
             for joint, share in zip(joint_names, self.by_joint, strict=True)
         )
         return (
-            f"Input {self.name}: {-100 * self.share:.0f} % unexplained motion on blocks left out "
+            f"Input {self.name}: {-100 * self.share:.0f} % unexplained motion "
             f"(by one joint alone: {alone})."
         )
 
@@ -259,8 +260,9 @@ class FitResult:
         for label, values in schedule.coefficient_sets().items():
             where = "" if label == "always" else f", {label.replace('_', ' ')}"
             for joint, of_joint in zip(joints, values.tolist(), strict=True):
-                for name, value in zip(schedule.coefficient_names, of_joint, strict=True):
-                    rows[f"{name} of {joint}{where}"] = (value, math.nan, math.nan)
+                for c, value in zip(self.model.law.coefficients, of_joint, strict=True):
+                    if c != HEAT:
+                        rows[f"{c.name} of {joint}{where}"] = (value, math.nan, math.nan)
         rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
         table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
         unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}

@@ -15,7 +15,6 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
-import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +29,7 @@ from nfriction.fitting.result.identifiability import observed_count
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import Rows, normal_equations, scaled_rows
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, deflected
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected, substepped
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -148,7 +147,7 @@ class ShootingProblem:
     @cached_property
     def _moving(self) -> FrictionModel:
         """A copy of the friction model, which every simulation moves to its parameters."""
-        return copy.deepcopy(self.friction)
+        return substepped(self.friction, self.substeps)
 
     def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
         """The windows' motion at `x`, valid until the next call; memory only for derivatives."""
@@ -160,9 +159,12 @@ class ShootingProblem:
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
-        inputs = RolloutInputs(q0 + offsets, qd0, held, step, law_state=law_state)
+        inputs = RolloutInputs(
+            q0 + offsets, qd0, held, step, law_state=law_state,
+            hidden_state=self.windows.hidden_state,
+        )  # fmt: skip
         motion = self._integrate(self.plant_at(plant), model, inputs)
-        memory = self._memory_along(model, motion) if with_memory else None
+        memory = self.windows.states_along(model, motion) if with_memory else None
         return Trajectory(model, plant, motion, linearised, step, memory, law_slope)
 
     def _torques(self, plant: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,17 +177,6 @@ class ShootingProblem:
 
     def _integrate(self, plant: Plant, model: FrictionModel, inputs: RolloutInputs) -> Rollout:
         return integrate(plant, model, inputs)
-
-    @torch.no_grad()
-    def _memory_along(self, model: FrictionModel, motion: Rollout) -> Tensor | None:
-        """Memory at every step of a motion, (window, step + 1, joint, state_size)."""
-        schedule = model.schedule
-        if not schedule.state_size:
-            return None
-        rows = [schedule.initial_state(motion.qd[:, 0], motion.qdd[:, 0])]
-        for qd, qdd in zip(motion.qd.unbind(1)[1:], motion.qdd.unbind(1)[1:], strict=True):
-            rows.append(schedule.advance(qd, qdd, rows[-1]))
-        return torch.stack(rows, 1)
 
     def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
         """Simulated less measured position in recorded coordinates, (window, step + 1, joint)."""

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -12,6 +12,8 @@ from nfriction.fitting.adjusted_plant import PlantParameter
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
+from nfriction.friction.heat import Heated
+from nfriction.friction.inputs import is_heated
 from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
 
@@ -21,6 +23,15 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
     moved = copy.deepcopy(model)
     moved.schedule.set_parameter_vector(vector)
     return moved
+
+
+def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
+    """A copy of a friction model for simulations that count substeps as samples."""
+    copied = copy.deepcopy(model)
+    if is_heated(model.law):
+        schedule = cast("Heated", copied.schedule)
+        schedule.set_sample_time(schedule.sample_time / substeps)
+    return copied
 
 
 def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:

@@ -118,10 +118,9 @@ class ShootingFitter:
         """The problem of windows that starts at these friction parameters."""
         model = model_at(self.friction, friction)
         longest_step = max(r.longest_step for r in self.recordings)
-        if model.law.memory:
-            windows = windows.deflected(self.jacobian.plant, model)
         return ShootingProblem(
-            self.jacobian, model, windows, noise, self.measurement,
+            self.jacobian, model, windows.with_states(self.jacobian.plant, model), noise,
+            self.measurement,
             substeps=integration_substeps(
                 self.jacobian.plant, model, longest_step, self.options
             ),

@@ -10,6 +10,7 @@ from torch import Tensor
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.variables import model_at
 from nfriction.fitting.strategy.continuation import settle_states
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -78,9 +79,8 @@ def holdout_squares(
     Raises:
         StoppedError: if the search of the initial states was interrupted.
     """
-    if problem.friction.law.memory:
-        test = test.deflected(problem.jacobian.plant, problem.friction)
-    judged = replace(problem, windows=test)
+    model = model_at(problem.friction, friction)
+    judged = replace(problem, windows=test.with_states(problem.jacobian.plant, model))
     x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
     if stopped:
         raise StoppedError

@@ -1,8 +1,8 @@
 """Inputs of friction besides the speed, chosen by what a law leaves unexplained.
 
-A candidate is a term of the law with a coefficient of its own (`friction.inputs`). Its gain is that
-of one Gauss-Newton step from the fitted law, on contiguous blocks of the recordings that took no
-part in the step: one linearisation of each block gives the gain of every candidate.
+A candidate is a term of the law with a coefficient of its own (`friction.inputs`). Its evidence is
+that of the Gauss-Newton model at the fitted law, in which one linearisation has every candidate.
+Which candidates a fit takes is then decided on windows held out.
 """
 
 import copy
@@ -10,22 +10,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms
-from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
+    HorizonResult,
     ShootingFitter,
     loglik_tolerance,
     settle_states,
     weighted_cost,
 )
+from nfriction.fitting.strategy.holdout import StoppedError
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -34,12 +35,15 @@ from nfriction.fitting.task import (
     regression,
 )
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.inputs import INPUTS, with_inputs
+from nfriction.friction.heat import HeatedConstant
+from nfriction.friction.inputs import INPUTS, is_heated, with_inputs
+from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import PendulumChain, Plant
 from nfriction.plant.rigs import from_dict
+from nfriction.signals import Motion
 
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
@@ -58,15 +62,51 @@ def candidates(task: FitTask) -> tuple[str, ...]:
     # A bearing's load is known of chains on a fixed pivot; a law of the load has seen one.
     known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
     loaded = known and torch.equal(*torques)
-    return tuple(name for name in INPUTS if name != "load" or loaded)
+    # The papers' network may have a hidden state of its own.
+    heated = "network" not in task.model.options()
+    possible = {"direction": True, "load": loaded, "heat": heated}
+    return tuple(name for name in INPUTS if possible[name])
 
 
-def widened_fitter(task: FitTask, start: FitResult, inputs: Sequence[str]) -> ShootingFitter:
-    """Fitter of a law's constant coefficients and those of inputs, from a fit of the law."""
+def longest_duration(motions: Sequence[Motion]) -> float:
+    """Duration of the longest motion [s]."""
+    return max(float(motion.time[-1] - motion.time[0]) for motion in motions)
+
+
+def heated_schedule(
+    law: Law, initial: Tensor, motions: Sequence[Motion], cooling_time: float
+) -> HeatedConstant:
+    """Constant coefficients of a law with heat, which is 1 where motions heat cold friction most.
+
+    Args:
+        law, initial: see `Constant`; `initial` is without any fall by heat.
+        motions: in joint coordinates.
+        cooling_time: [s].
+    """
+    schedule = HeatedConstant(law, len(initial), initial)
+    step = float(np.median(np.concatenate([np.diff(motion.time) for motion in motions])))
+    schedule.set_heat(1.0, cooling_time, step)
+    heat = [schedule.states(*map(torch.as_tensor, (m.qd, m.qdd))) for m in motions]
+    # A joint without friction stays cold at any capacity.
+    most = torch.cat(heat).amax((0, 2))
+    schedule.set_heat(torch.where(most > 0, most, 1.0), cooling_time, step)
+    return schedule
+
+
+def widened_fitter(
+    task: FitTask, start: FitResult, inputs: Sequence[str], cooling_time: float = math.nan
+) -> ShootingFitter:
+    """Fitter of a law's constant coefficients and those of inputs, from a fit of the law.
+
+    With the input heat, which cools within `cooling_time` [s].
+    """
     law, plant = with_inputs(start.model.law, inputs), seeing_plant(task.plant, inputs)
     known = start.model.schedule.coefficient_sets()["always"]
-    initial = torch.cat([known, known.new_zeros(len(known), len(inputs))], 1)
-    model = FrictionModel(law, Constant(law, start.model.joints, initial), start.model.v_smooth)
+    initial = torch.cat([known, known.new_zeros(len(known), len(law.names) - known.shape[1])], 1)
+    schedule = Constant(law, start.model.joints, initial)
+    if is_heated(law):
+        schedule = heated_schedule(law, initial, task.motions, cooling_time)
+    model = FrictionModel(law, schedule, start.model.v_smooth)
     terms = adjustable_terms(
         plant, task.recordings, task.options, eccentric=fits_eccentricity(task.options, start),
         per_recording=bool(start.encoder_offsets),
@@ -79,21 +119,48 @@ def widened_fitter(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Sh
 
 
 def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
-    """Constant fit of a law with inputs, from that without; None if stopped."""
-    fitter = widened_fitter(task, start, inputs)
-    windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
-    noise = max(effective_noise(start.residuals), task.options.min_noise)
-    problem = fitter.problem(windows, noise, fitter.friction.schedule.parameter_vector())
-    known = known_terms(start, fitter.jacobian.terms)
-    x, stopped = settle_states(problem, problem.variables.start(known))
-    if stopped:
+    """Constant fit of a law with inputs, from that without; None if stopped.
+
+    The time in which heat cools is that of the lowest residual, between a window, within which a
+    network sees the motion itself, and the longest recording.
+    """
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    horizon, longest = (
+        start.longest_usable_horizon(task.options.windows), longest_duration(task.motions)
+    )  # fmt: skip
+    ends: list[HorizonResult] = []
+
+    def residual(log_time: float) -> float:
+        """Residual of a search with this cooling time, from the end of the one before."""
+        fitter = widened_fitter(task, start, inputs, math.exp(log_time))
+        friction = fitter.friction.schedule.parameter_vector()
+        plant, residuals = known_terms(start, fitter.jacobian.terms), start.residuals
+        # Beside the noise that the law without inputs leaves, a first search is drawn to the prior;
+        # and its windows start with the heat that the friction before it leaves.
+        for _ in range(1 if ends else 2):
+            if ends:
+                (friction, plant, *_), residuals = ends[-1].parts, ends[-1].residuals
+            noise = max(effective_noise(residuals), task.options.min_noise)
+            tolerance = loglik_tolerance(weighted_cost(residuals, noise), task.options)
+            problem = fitter.problem(fitter.cut(task.motions, horizon), noise, friction)
+            x, stopped = settle_states(problem, problem.variables.start(plant))
+            end = fitter.search(problem, x, tolerance, "law with further inputs")
+            if stopped or end.stopped or not math.isfinite(end.rms):
+                raise StoppedError
+            ends.append(end)
+        return end.rms
+
+    try:
+        residual(math.log(longest))
+        if "heat" in inputs and longest > horizon:
+            between = math.log(horizon), math.log(longest)
+            minimize_scalar(residual, bounds=between, method="bounded", options={"xatol": 0.2})
+    except StoppedError:
         return None
-    tolerance = loglik_tolerance(weighted_cost(start.residuals, noise), task.options)
-    end = fitter.search(problem, x, tolerance, "law with further inputs")
-    if end.stopped or not math.isfinite(end.rms):
-        return None
-    model = copy.deepcopy(fitter.friction)
-    found = result_from_shooting(model, end.problem, end.result, task.motions)
+    best = min(ends, key=lambda end: end.rms)
+    model = copy.deepcopy(best.problem.friction)
+    found = result_from_shooting(model, best.problem, best.result, task.motions)
     return replace(
         found, encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons
     )
@@ -121,24 +188,24 @@ def drives(found: FitResult, own: int) -> bool:
 
 
 def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
-    """Inputs that explain motion on blocks left out, the best first; each beside those before.
+    """Inputs that evidence favours, the best first; each beside those before.
 
     Args:
         task: with recordings and motions free of encoder offsets.
         start: constant fit of the law.
     """
     names = candidates(task)
-    fitter = widened_fitter(task, start, names)
+    fitter = widened_fitter(task, start, names, longest_duration(task.motions))
     choice = _Choice.of(fitter, task, start, names)
-    return () if choice is None else tuple(choice.forward(task.options.input_chance))
+    return () if choice is None else tuple(choice.forward(task.options.evidence_gain))
 
 
 @dataclass(frozen=True)
 class _Choice:
-    """Local models of blocks over the shared variables, states at their best, and the prior's."""
+    """Local model of the cost over the shared variables, window states at their best."""
 
-    blocks: Sequence[Quadratic]
-    prior: Quadratic
+    local: Quadratic
+    precision: Tensor  # of the priors
     bounds: tuple[Tensor, Tensor]  # of a step
     columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
 
@@ -149,104 +216,74 @@ class _Choice:
         windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
         noise, model = effective_noise(start.residuals), fitter.friction
         stride = decimation(start.residuals, task.options)
-        known = known_terms(start, fitter.jacobian.terms)
-        found = []
-        for block in contiguous_blocks(windows, task.options.folds):
-            problem = fitter.problem(
-                windows.subset(block), noise, model.schedule.parameter_vector(), stride=stride
-            )
-            x, stopped = settle_states(problem, problem.variables.start(known))
-            local = problem.linearise(x)
-            if stopped or not local.finite:
-                return None
-            variables = problem.variables
-            shared, (precision, mean) = variables.shared_count, variables.prior()
-            off, pull = (x - mean)[:shared], (precision * (x - mean))[:shared]
-            prior = Quadratic(0.5 * off @ pull, pull, torch.diag(precision[:shared]))
-            found.append(_of_errors(local, prior))
+        values = model.schedule.parameter_vector()
+        problem = fitter.problem(windows, noise, values, stride=stride)
+        variables = problem.variables
+        x, stopped = settle_states(
+            problem, variables.start(known_terms(start, fitter.jacobian.terms))
+        )
+        local = problem.linearise(x)
+        if stopped or not local.finite:
+            return None
+        shared = variables.shared_count
         lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
-        own = rows.shape[1] - len(names)
-        columns = {name: rows[:, own + k].tolist() for k, name in enumerate(names)}
-        return cls(found, prior, (lower.clamp(max=0.0), upper.clamp(min=0.0)), columns)
+        place = model.law.names.index
+        columns = {name: rows[:, place(INPUTS[name].name)].tolist() for name in names}
+        bounds = lower.clamp(max=0.0), upper.clamp(min=0.0)
+        return cls(_of_shared(local, shared), variables.prior()[0][:shared], bounds, columns)
 
-    def forward(self, chance: float) -> list[InputGain]:
-        """Inputs one after the other, as long as one gains by more than its scatter over blocks."""
+    def forward(self, least: float) -> list[InputGain]:
+        """Inputs one after the other, as long as one raises the log evidence by more than this."""
         chosen: list[InputGain] = []
         held: list[int] = []
         while len(chosen) < len(self.columns):
-            before = self.left_out(held)
-            shares = {}
-            for name, columns in self.columns.items():
-                if columns[0] in held:
-                    continue
-                after = self.left_out([*held, *columns])
-                if gains(after, before, chance):
-                    shares[name] = float(1.0 - after.sum() / before.sum())
-            if not shares:
+            before, left = self.evidence(held)
+            found = {
+                name: self.evidence([*held, *columns])
+                for name, columns in self.columns.items()
+                if columns[0] not in held
+            }
+            best = max(found, key=lambda name: found[name][0])
+            if not found[best][0] - before > least:
                 break
-            best = max(shares, key=lambda name: shares[name])
             by_joint = tuple(
-                float(1.0 - self.left_out([*held, column]).sum() / before.sum())
-                for column in self.columns[best]
+                1.0 - self.evidence([*held, column])[1] / left for column in self.columns[best]
             )
-            chosen.append(InputGain(best, shares[best], by_joint))
+            chosen.append(InputGain(best, 1.0 - found[best][1] / left, by_joint))
             held += self.columns[best]
         return chosen
 
-    def left_out(self, held: Sequence[int]) -> Tensor:
-        """Cost of each block after a step by the others, (block,), with the columns `held`."""
-        every = {c for columns in self.columns.values() for c in columns}
-        free = [k for k in range(len(self.prior.gradient)) if k not in every or k in held]
+    def evidence(self, held: Sequence[int]) -> tuple[float, float]:
+        """Log evidence with the columns `held`, up to a constant, and the cost at the minimum.
+
+        By Laplace's approximation at the minimum within the bounds.
+        """
+        others = {c for columns in self.columns.values() for c in columns}.difference(held)
+        free = [k for k in range(len(self.precision)) if k not in others]
+        gradient, hessian = self.local.gradient[free], self.local.hessian[free][:, free]
         lower, upper = (bound[free] for bound in self.bounds)
-        costs = []
-        for place, block in enumerate(self.blocks):
-            others = [b for k, b in enumerate(self.blocks) if k != place]
-            parts = [_subset(q, free) for q in (self.prior, *others)]
-            gradient = torch.stack([p.gradient for p in parts]).sum(0)
-            hessian = torch.stack([p.hessian for p in parts]).sum(0)
-            cost = sum(float(p.cost) for p in parts)
 
-            def model(
-                x: Tensor, c: float = cost, g: Tensor = gradient, H: Tensor = hessian
-            ) -> Quadratic:
-                return Quadratic(c + g @ x + 0.5 * x @ H @ x, g + H @ x, H)
+        def model(x: Tensor) -> Quadratic:
+            slope = gradient + hessian @ x
+            return Quadratic(self.local.cost + 0.5 * x @ (gradient + slope), slope, hessian)
 
-            start = torch.zeros(len(free), dtype=torch.float64)
-            step = LevenbergMarquardt().minimise(model, start, lower=lower, upper=upper).x
-            own = _subset(block, free)
-            costs.append(own.cost + own.gradient @ step + 0.5 * step @ own.hessian @ step)
-        return torch.stack([torch.as_tensor(c) for c in costs])
+        end = LevenbergMarquardt().minimise(model, 0.0 * gradient, lower=lower, upper=upper)
+        moved = lower < upper
+        spread = torch.linalg.slogdet(hessian[moved][:, moved]).logabsdet
+        cost, prior = float(model(end.x).cost), float(self.precision[list(held)].log().sum())
+        return 0.5 * (prior - float(spread)) - cost, cost
 
 
-def contiguous_blocks(windows: Windows, folds: int) -> list[Tensor]:
-    """Masks (window,) of contiguous stretches, up to `folds` of each recording."""
-    place = torch.tensor([span[0] for span in windows.spans])
-    blocks = []
-    for recording in place.unique().tolist():
-        own = (place == recording).nonzero().flatten()
-        for part in own.tensor_split(min(folds, len(own))):
-            mask = torch.zeros(len(windows), dtype=torch.bool)
-            mask[part] = True
-            blocks.append(mask)
-    return blocks
-
-
-def _of_errors(local: Quadratic, prior: Quadratic) -> Quadratic:
-    """Local model over the shared variables by the errors alone, the others at their best."""
-    shared = len(prior.gradient)
+def _of_shared(local: Quadratic, shared: int) -> Quadratic:
+    """Local model of the first variables, with the others at their best."""
     H, g = local.hessian, local.gradient
     solved = torch.linalg.solve(
         H[shared:, shared:], torch.cat([H[shared:, :shared], g[shared:, None]], 1)
     )
     across = H[:shared, shared:]
     return Quadratic(
-        local.cost - prior.cost - 0.5 * g[shared:] @ solved[:, -1],
-        g[:shared] - prior.gradient - across @ solved[:, -1],
-        H[:shared, :shared] - prior.hessian - across @ solved[:, :-1],
+        local.cost - 0.5 * g[shared:] @ solved[:, -1],
+        g[:shared] - across @ solved[:, -1],
+        H[:shared, :shared] - across @ solved[:, :-1],
     )
-
-
-def _subset(local: Quadratic, index: Sequence[int]) -> Quadratic:
-    rows = list(index)
-    return Quadratic(local.cost, local.gradient[rows], local.hessian[rows][:, rows])

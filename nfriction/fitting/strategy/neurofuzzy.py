@@ -48,7 +48,9 @@ from nfriction.fitting.strategy.inputs import (
     InputGain,
     chosen_inputs,
     drives,
+    longest_duration,
     seeing_plant,
+    widened_fitter,
     widened_start,
 )
 from nfriction.fitting.task import (
@@ -58,6 +60,9 @@ from nfriction.fitting.task import (
     known_terms,
     regression,
 )
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.heat import Heated
+from nfriction.friction.inputs import is_heated
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
@@ -74,17 +79,24 @@ INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
-    if isinstance(task.model, NeuroFuzzyModel):
-        task = replace(task, plant=seeing_plant(task.plant, task.model.inputs or ()))
-    start = constant_start(task)
+    given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
+    task = replace(task, plant=seeing_plant(task.plant, given))
+    heated = is_heated(task.model.law)
+    start = constant_start(_without_inputs(task) if heated else task)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
     aligned = replace(task, recordings=recordings, motions=motions)
-    contest = _Contest(aligned, start)
+    widened = widened_start(aligned, start, given) if heated else start
+    if widened is None:
+        cold = widened_fitter(aligned, start, given, longest_duration(motions)).friction
+        start = replace(start, model=cold)
+    contest = _Contest(aligned, widened or start)
     chosen: tuple[InputGain, ...] = ()
     model = task.model
     try:
+        if widened is None:
+            raise StoppedError
         contest.train()
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
@@ -97,8 +109,17 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
+    if is_heated(model.law):
+        said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
+
+
+def _without_inputs(task: FitTask) -> FitTask:
+    """The task of the law itself, with constant coefficients."""
+    model = cast("NeuroFuzzyModel", task.model)
+    schedule = Constant(model.definition, model.joints)
+    return replace(task, model=FrictionModel(model.definition, schedule, model.v_smooth))
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
@@ -253,6 +274,8 @@ def initialise_from_constant(
     schedule.set_range(*input_range(motions, schedule.along_motion, options))
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
     schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+    if is_heated(model.law):
+        cast("Heated", schedule).take_heat(cast("Heated", constant.model.schedule))
     return network
 
 

@@ -1,0 +1,59 @@
+"""Exports of friction that falls with heat, which is a state of the controller."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction import ModelInfo, export
+from nfriction.export.c_file import c_runner, find_compiler
+from tests.friction.samples import motion, warming_network
+
+MODEL, INFO = warming_network(), ModelInfo(sample_time=2e-3)
+
+
+def along(qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
+    """Torque and heat at each sample of a motion that starts cold."""
+    state, found = MODEL.initial_state(qd[0], qdd[0]), []
+    for v, a, n in zip(qd, qdd, load, strict=True):
+        state = MODEL.advance(v, a, state)
+        found.append((MODEL.torque(v, n, MODEL.coefficients_from(v, a, state)), state[..., 0]))
+    torque, heat = zip(*found, strict=True)
+    return torch.stack(torque), torch.stack(heat)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_c_heats_as_the_model_does_and_starts_cold_after_a_reset(tmp_path: Path) -> None:
+    given = motion(400, 2)
+    torque, heat = along(*given)
+    run = c_runner(export.c(MODEL, tmp_path, INFO)[0])
+    for _ in range(2):
+        tau, coefficients, status = run(*(x.numpy() for x in given))
+        np.testing.assert_allclose(tau, torque, rtol=0, atol=1e-13 * float(torque.abs().max()))
+        np.testing.assert_allclose(coefficients[..., -1], heat, rtol=1e-12, atol=1e-15)
+        assert not (status & 2).any()
+    assert heat[-1].min() > 0.05
+
+
+def test_torchscript_heats_as_the_model_does(tmp_path: Path) -> None:
+    given = motion(200, 2)
+    module = torch.jit.load(str(export.torchscript(MODEL, tmp_path / "model.pt", INFO)))
+    state, found = module.initial_state(given[0][0], given[1][0]), []
+    for sample in zip(*given, strict=True):
+        tau, _, _, state = module.step(*sample, state)
+        found.append(tau)
+    torch.testing.assert_close(torch.stack(found), along(*given)[0], rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["model.pt2", "model.onnx"])
+def test_other_files_heat_as_the_model_does(name: str, tmp_path: Path) -> None:
+    if name.endswith("onnx"):
+        pytest.importorskip("onnx")
+    write = export.onnx if name.endswith("onnx") else export.pt2
+    path = write(MODEL, tmp_path / name, INFO)
+    verdict = export.verify_artefact(path, MODEL, INFO, points=500)
+    assert verdict.passed
+    assert verdict.points.torque_error < 1e-12

@@ -1,0 +1,117 @@
+"""Friction that falls with the heat of its joint."""
+
+import math
+
+import pytest
+import torch
+
+from nfriction import CVFM, NFCVFM, load, rollout, save
+from nfriction.friction.heat import HeatedConstant
+from nfriction.friction.inputs import with_inputs
+from nfriction.friction.laws import COULOMB_VISCOUS
+from nfriction.friction.models import FrictionModel
+from nfriction.io.model_file import ModelFileError
+from tests.fitting.recordings import pendulum
+from tests.friction.samples import motion, warming_network
+
+F64 = torch.float64
+LAW = with_inputs(COULOMB_VISCOUS, ["direction", "load", "heat"])
+STEP = 2e-3
+
+
+def warming(fall: float = 0.8) -> FrictionModel:
+    values = [[5e-3, 1e-3, 1e-3, 2e-3, fall, 0.0], [2e-3, 5e-4, -5e-4, 1e-3, 0.5 * fall, 0.0]]
+    schedule = HeatedConstant(LAW, 2, values)
+    schedule.set_heat([2e-2, 1e-2], 3.0, STEP)
+    return FrictionModel(LAW, schedule, 0.02).requires_grad_(False)
+
+
+@pytest.mark.parametrize("make", [warming, warming_network])
+def test_heat_along_a_motion_is_that_of_its_samples(make) -> None:
+    model, (qd, qdd, _) = make(), motion(300, 2)
+    state = model.initial_state(qd[0], qdd[0])
+    assert not state.any()
+    rows = [state]
+    for k in range(1, len(qd)):
+        rows.append(model.advance(qd[k], qdd[k], rows[-1]))
+    torch.testing.assert_close(model.schedule.states(qd, qdd), torch.stack(rows))
+
+
+def test_a_constant_power_heats_a_joint_to_its_balance_with_cooling() -> None:
+    schedule = HeatedConstant(with_inputs(COULOMB_VISCOUS, ["heat"]), 1, [0.2, 0.1, 0.0, 0.0])
+    schedule.set_heat(0.5, 0.3, STEP)
+    speed = torch.full((2000, 1), 3.0, dtype=F64)
+    power = 3.0 * (0.2 + 0.1 * 3.0)
+    heat = schedule.states(speed, 0.0 * speed)[-1]
+    # The sum of a geometric series, which tends to P T / C as the step tends to zero.
+    expected = STEP / 0.5 * power / (1.0 - math.exp(-STEP / 0.3))
+    assert float(heat) == pytest.approx(expected, rel=1e-3)
+    assert expected == pytest.approx(power * 0.3 / 0.5, rel=0.01)
+
+
+@pytest.mark.parametrize("make", [warming, warming_network])
+def test_friction_falls_by_the_exponential_of_heat(make) -> None:
+    model, (qd, qdd, normal) = make(), motion(50, 2)
+    cold = model(qd, qdd, normal)
+    heat = torch.full((50, 2, 1), 0.7, dtype=F64)
+    held = model.coefficients_from(qd, qdd, heat)
+    fall = torch.exp(-0.7 * held[..., -2])
+    assert ((fall < 1) & (fall > 0)).all()
+    torch.testing.assert_close(model.torque(qd, normal, held), fall * cold)
+
+
+def test_compiled_and_eager_rollouts_heat_alike_and_lose_less_than_cold_friction() -> None:
+    start = torch.tensor([2.0, 0.5], dtype=F64)
+    plant = pendulum(normal_load="bearing")
+    given = {"sample_time": STEP, "steps": 1500, "gradients": False}
+    runs = [
+        rollout(plant, warming(), start, 0 * start, backend=backend, **given)
+        for backend in ("compiled", "torch")
+    ]
+    torch.testing.assert_close(runs[0].q, runs[1].q, rtol=0, atol=1e-10)
+    cold = rollout(plant, warming(0.0), start, 0 * start, **given)
+    late = slice(1200, None)
+    assert runs[0].qd[late].square().sum() > 1.1 * cold.qd[late].square().sum()
+
+
+def test_a_motion_continues_with_the_heat_that_it_had() -> None:
+    plant, model = pendulum(normal_load="bearing"), warming()
+    start = torch.tensor([2.0, 0.5], dtype=F64)
+    given = {"sample_time": STEP, "gradients": False}
+    whole = rollout(plant, model, start, 0 * start, steps=1000, **given)
+    heat = model.schedule.states(whole.qd, whole.qdd)
+    half = rollout(plant, model, whole.q[500], whole.qd[500], steps=500,
+                   hidden_state=heat[500], **given)  # fmt: skip
+    # The acceleration of the first sample is another, and heat needs none.
+    torch.testing.assert_close(half.q[-1], whole.q[-1], rtol=0, atol=1e-9)
+
+
+def test_a_model_file_keeps_the_heat(tmp_path) -> None:
+    model = warming_network()
+    again = load(save(model, tmp_path / "m.json"))
+    assert again.schedule.heat_capacity.tolist() == pytest.approx([3.0, 4.0])
+    assert again.schedule.cooling_time == pytest.approx(2.0)
+    qd, qdd, _ = motion(40, 2)
+    assert torch.equal(again.schedule.states(qd, qdd), model.schedule.states(qd, qdd))
+
+
+def test_a_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
+    model = warming_network()
+    model.schedule.log_heat_capacity.fill_(-800.0)
+    with pytest.raises(ModelFileError, match="no finite torque"):
+        load(save(model, tmp_path / "m.json"))
+
+
+@pytest.mark.parametrize("given", [(0.0, 1.0, 1.0), (1.0, math.nan, 1.0), (1.0, 1.0, -1.0)])
+def test_heat_is_refused_where_a_constant_is_not_positive(given) -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        warming().schedule.set_heat(*given)
+
+
+def test_the_papers_network_refuses_heat() -> None:
+    with pytest.raises(ValueError, match='needs `network="anfis"`'):
+        NFCVFM(1, network="rbf", inputs=["heat"])
+
+
+def test_without_heat_nothing_is_remembered() -> None:
+    assert NFCVFM(2, inputs=["load"]).state_size == CVFM(2).state_size == 0
