@@ -15,8 +15,6 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -27,33 +25,6 @@ from nfriction.papers.nffem.jacobian import NormalEquations
 
 # A group whose prior outweighs its data by this factor is switched off; alpha stops there.
 LARGEST_RATIO = 1e12
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceProblem:
-    """Errors to be fitted, and priors of the parameters.
-
-    Args:
-        equations: J^T J, J^T e and E_D = sum e^2 at given parameters.
-        samples: number n of errors that E_D sums.
-        prior: w0, shape (p,).
-        groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
-        names: of the groups.
-        squares: E_D alone, where that is cheaper; tries the steps.
-    Raises:
-        ValueError: no samples.
-    """
-
-    equations: Callable[[Tensor], NormalEquations]
-    samples: int
-    prior: Tensor
-    groups: Tensor
-    names: Sequence[str]
-    squares: Callable[[Tensor], Tensor] | None = None
-
-    def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise ValueError(f"`samples` must be positive, got {self.samples}.")
 
 
 class Posterior(NamedTuple):
@@ -75,19 +46,24 @@ class Posterior(NamedTuple):
 
 
 def posterior(
-    problem: EvidenceProblem, local: NormalEquations, w: Tensor, alpha: Tensor, beta: float
+    local: NormalEquations,
+    offset: Tensor,
+    groups: Tensor,
+    samples: int,
+    alpha: Tensor,
+    beta: float,
 ) -> Posterior:
     """Posterior, effective parameters and log evidence; exact where the model is linear.
 
     Args:
-        problem: errors and priors.
-        local: J^T J, J^T e and E_D at the parameters `w`.
-        w: parameters, shape (p,).
+        local: J^T J, J^T e and E_D at the parameters w.
+        offset: w - w0, shape (p,).
+        groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
+        samples: number n of errors that E_D sums.
         alpha: prior precision (halved) of each group, shape (groups,), positive.
         beta: noise precision (halved), positive.
     """
-    groups, offset, count = problem.groups, w - problem.prior, len(alpha)
-    precision = alpha[groups]
+    count, precision = len(alpha), alpha[groups]
     # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
     scale, factor = factorise(beta * local.JtJ + precision.diag())
     inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
@@ -101,7 +77,7 @@ def posterior(
     log_evidence = (
         -beta * local.squares
         - alpha @ squares
-        + 0.5 * problem.samples * math.log(beta / math.pi)
+        + 0.5 * samples * math.log(beta / math.pi)
         + 0.5 * sizes @ alpha.log()
         - 0.5 * log_determinant
     )
@@ -115,9 +91,10 @@ def posterior(
 
 
 def reestimate(
-    problem: EvidenceProblem,
     known: Posterior,
     local: NormalEquations,
+    groups: Tensor,
+    samples: int,
     alpha: Tensor,
     largest_beta: float = math.inf,
 ) -> tuple[Tensor, float]:
@@ -126,15 +103,15 @@ def reestimate(
     A group that has not left its prior's centre keeps its alpha: it has no information yet.
 
     Args:
-        problem, local, alpha: those of the posterior `known`.
         known: `posterior` at the present alpha and beta.
+        local, groups, samples, alpha: those of this posterior.
         largest_beta: limit by a known noise floor.
     Returns:
         The new alpha, shape (groups,), and beta.
     """
-    curvature = group_sums(local.JtJ.diagonal(), problem.groups, len(alpha))
+    curvature = group_sums(local.JtJ.diagonal(), groups, len(alpha))
     # As many parameters as samples would leave no noise at all.
-    beta = float((problem.samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
+    beta = float((samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
     beta = min(beta, largest_beta)
     limit = LARGEST_RATIO * beta * curvature
     # A group without curvature has no scale for a limit.

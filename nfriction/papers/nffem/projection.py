@@ -19,7 +19,7 @@ from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy.partition import FreePartition
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
-from nfriction.papers.nffem.jacobian import CHUNK_ENTRIES, flatten, trainable, unflatten
+from nfriction.papers.nffem.jacobian import CHUNK_ENTRIES, assign, flatten, trainable
 
 FuzzyNetwork = Anfis | AnfisRBF | RBFNetwork
 
@@ -181,10 +181,9 @@ class Projection:
         if layer.groups != 1:
             raise ValueError(f"`layer` must be of one group, got {layer.groups}.")
         self.layer, self.x, self.y, self.ridge = layer, x, y, ridge
-        self.parameters = {n: p for n, p in layer.named_parameters() if p.requires_grad}
-        sizes = torch.tensor([p.numel() for p in self.parameters.values()])
-        linear = torch.tensor([n in LINEAR for n in self.parameters]).repeat_interleave(sizes)
-        self.linear, self.moving = linear.to(x.device), ~linear.to(x.device)
+        parts = [torch.full_like(p, n in LINEAR).flatten() for n, p in trainable(layer).items()]
+        self.linear = torch.cat(parts).bool()
+        self.moving = ~self.linear
         self.shared = layer.readout().shape[2]
         self.total = layer.jacobian_columns(x[:1]).shape[1]
         # Of a fixed size, so that memory does not grow with the samples.
@@ -213,7 +212,7 @@ class Projection:
         """Half the squares, with the ridge's, of the best output layer, which the layer takes."""
         w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
-        self._assign(w)
+        assign(self.layer, w)
         G = self.x.new_zeros(self.shared, self.shared)
         b = self.x.new_zeros(self.shared, self.y.shape[-1])
         for rows in self._chunks():
@@ -227,7 +226,7 @@ class Projection:
         # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
         placed = _pulled_back(self._maps()[:, : self.shared], weights)
         w[self.linear] = placed[self.linear]
-        self._assign(w)
+        assign(self.layer, w)
         cost = 0.5 * (self.target_squares - (b * weights).sum())
         self._eliminated = _Eliminated(theta.clone(), weights, factor, cost)
         return cost
@@ -258,10 +257,6 @@ class Projection:
         maps = self._maps()[:, shared:, self.moving]
         hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)
         return Quadratic(known.cost, _pulled_back(maps, b), hessian)
-
-    def _assign(self, w: Tensor) -> None:
-        for name, value in unflatten(w, self.parameters).items():
-            self.parameters[name].copy_(value)
 
     def _maps(self) -> Tensor:
         """Shape (outputs, columns, parameters)."""
