@@ -111,7 +111,9 @@ def fit_joint(
             f"coefficients of {name}; measure at more velocities."
         )
     require_load(name, joint)
-    part = _balance(joint)
+    qd, _, load, tau = _columns(joint)
+    kept = torch.ones_like(qd, dtype=torch.bool)
+    part = TorqueBalance(qd, load, tau, kept, None, joint.step, [(0, len(joint) - 1)])
     found = regress(law, [part], v_smooth, options)
     schedule: Any = model.schedule
     values = found.coefficients
@@ -119,15 +121,15 @@ def fit_joint(
         schedule.set_parameter_vector(values.reshape(-1))
         lower, upper = schedule.bounds()
         names = schedule.parameter_names([joint.name])
-        kept = (lower < upper).nonzero().flatten()
+        free = (lower < upper).nonzero().flatten()
         known = Information(found.information[0], torch.zeros(len(names)).double())
-        own = known.subset(kept)
+        own = known.subset(free)
         part_root = covariance_root(own)
-        root = torch.zeros(len(names), len(kept)).double()
-        root[kept] = part_root
-        fitted = [names[i] for i in kept.tolist()]
+        root = torch.zeros(len(names), len(free)).double()
+        root[free] = part_root
+        fitted = [names[i] for i in free.tolist()]
         intervals = confidence_intervals(
-            fitted, values[0][kept], part_root.norm(dim=1), lower[kept], upper[kept]
+            fitted, values[0][free], part_root.norm(dim=1), lower[free], upper[free]
         )
         unknown = null_directions(fitted, own)
     else:
@@ -360,12 +362,6 @@ def _columns(joint: JointTorque) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     load = np.ones_like(joint.qd) if joint.load is None else joint.load
     qd, qdd, load_, tau = (torch.tensor(x)[:, None] for x in (joint.qd, joint.qdd, load, joint.tau))
     return qd, qdd, load_, tau
-
-
-def _balance(joint: JointTorque) -> TorqueBalance:
-    qd, _, load, tau = _columns(joint)
-    kept = torch.ones_like(qd, dtype=torch.bool)
-    return TorqueBalance(qd, load, tau, kept, None, joint.step, [(0, len(joint) - 1)])
 
 
 def _range(joint: JointTorque, options: FitOptions) -> tuple[float, list[float]]:

@@ -392,11 +392,6 @@ def balance_figure(motions: Mapping[str, Array]) -> Figure:
     below.set_ylabel("largest tilt [mrad]")
     below.set_xlabel("time [s]")
     handles = [asked, *(looks[name].handle for name in shown)]
-    style.legend(figure, handles, ["reference", *(_label(name) for name in shown)])
+    labels = {n: f"{n} compensated" for n in shown} | {NONE: "no compensation"}
+    style.legend(figure, handles, ["reference", *(labels[name] for name in shown)])
     return figure
-
-
-def _label(name: str) -> str:
-    return {NONE: "no compensation", TRUTH: "true friction compensated"}.get(
-        name, f"{name} compensated"
-    )
