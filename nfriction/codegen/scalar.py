@@ -264,10 +264,6 @@ def _unsigned(g: Graph, op: str, a: Node, b: Node) -> Node | None:
     return bare if signs == 2 else g.apply("neg", bare)
 
 
-def _neg(g: Graph, a: Node) -> Node | None:
-    return a.args[0] if a.op == "neg" else None
-
-
 def _pow(g: Graph, a: Node, b: Node) -> Node | None:
     if b.op != "constant":
         return None
@@ -324,7 +320,7 @@ _RULES: dict[str, Rule] = {
     "sub": _sub,
     "mul": _mul,
     "div": _div,
-    "neg": _neg,
+    "neg": lambda g, a: a.args[0] if a.op == "neg" else None,
     "pow": _pow,
     "where": _where,
     "and": _logical(False),

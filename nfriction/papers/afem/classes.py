@@ -60,14 +60,12 @@ class AccelerationClasses:
     """Classes of acceleration along recordings.
 
     Attributes:
-        thresholds: between low and medium, medium and high [rad/s^2], (joint, 2).
         labels: class of every sample, 0 to 2, (sample, joint) of each recording.
         stands_for: class whose coefficients each class takes: itself, or a neighbour where there
             are too few data of it, (joint, class).
         notes: joints and classes with too few data, in words.
     """
 
-    thresholds: Tensor
     labels: tuple[Tensor, ...]
     stands_for: Tensor
     notes: tuple[str, ...]
@@ -123,7 +121,6 @@ def find_classes(
     together = torch.cat(labels)
     seconds = torch.stack([(together == c).sum(0) for c in range(len(CLASSES))], -1) * step
     return AccelerationClasses(
-        thresholds=schedule.thresholds.clone(),
         labels=tuple(labels),
         stands_for=_merged(seconds, options.least, joints, notes),
         notes=tuple(notes),

@@ -191,7 +191,6 @@ class Projection:
         # Written again and again: the first touch of fresh memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
         self.target_squares = y.square().sum()
-        self._eliminated: _Eliminated | None = None
 
     @property
     def theta(self) -> Tensor:
@@ -207,9 +206,13 @@ class Projection:
         )
         return whole and bool(self.moving.any())
 
-    @torch.no_grad()
     def cost(self, theta: Tensor) -> Tensor:
         """Half the squares, with the ridge's, of the best output layer, which the layer takes."""
+        return self._eliminate(theta)[0]
+
+    @torch.no_grad()
+    def _eliminate(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost, best output layer (regressors, outputs), and the factor of the regressors' Gram."""
         w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
         assign(self.layer, w)
@@ -227,9 +230,7 @@ class Projection:
         placed = _pulled_back(self._maps()[:, : self.shared], weights)
         w[self.linear] = placed[self.linear]
         assign(self.layer, w)
-        cost = 0.5 * (self.target_squares - (b * weights).sum())
-        self._eliminated = _Eliminated(theta.clone(), weights, factor, cost)
-        return cost
+        return 0.5 * (self.target_squares - (b * weights).sum()), weights, factor
 
     @torch.no_grad()
     def quadratic(self, theta: Tensor) -> Quadratic:
@@ -238,12 +239,7 @@ class Projection:
         References:
             Golub and Pereyra (1973); L. Kaufman, BIT 15 (1975) 49-57.
         """
-        known = self._eliminated
-        # The solver has just evaluated the cost there, except at its start.
-        if known is None or not torch.equal(known.theta, theta):
-            self.cost(theta)
-            known = self._eliminated
-        assert known is not None
+        cost, weights, factor = self._eliminate(theta)
         shared = self.shared
         A = self.x.new_zeros(self.total - shared, self.total)
         b = self.x.new_zeros(self.total - shared, self.y.shape[-1])
@@ -251,12 +247,12 @@ class Projection:
             out = self.buffer[:, :, : rows.stop - rows.start]
             F = self.layer.jacobian_columns(self.x[rows], out)[0]
             A.addmm_(F[shared:], F.T)
-            b.addmm_(F[shared:], F[:shared].T @ known.weights - self.y[rows, 0])
+            b.addmm_(F[shared:], F[:shared].T @ weights - self.y[rows, 0])
         # Schur complement: curvature that the re-optimised output layer removes.
-        explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, known.factor)
+        explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, factor)
         maps = self._maps()[:, shared:, self.moving]
         hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)
-        return Quadratic(known.cost, _pulled_back(maps, b), hessian)
+        return Quadratic(cost, _pulled_back(maps, b), hessian)
 
     def _maps(self) -> Tensor:
         """Shape (outputs, columns, parameters)."""
@@ -266,16 +262,6 @@ class Projection:
         n = len(self.x)
         for start in range(0, n, self.buffer.shape[-1]):
             yield slice(start, min(start + self.buffer.shape[-1], n))
-
-
-@dataclass(frozen=True, eq=False)
-class _Eliminated:
-    """The best output layer at `theta`: weights (regressors, outputs), factor of their Gram."""
-
-    theta: Tensor
-    weights: Tensor
-    factor: Tensor
-    cost: Tensor
 
 
 def _pulled_back(maps: Tensor, columns: Tensor) -> Tensor:
