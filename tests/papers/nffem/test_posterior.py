@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from nfriction.papers.nffem.evidence import Posterior, posterior, reestimate
 from nfriction.papers.nffem.jacobian import NormalEquations
-from nfriction.papers.nffem.posterior import Posterior, posterior, reestimate
 from tests.papers.nffem.networks import F64, noise
 
 N, GROUPS = 30, torch.tensor([0, 0, 1, 1, 1])
