@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from nfriction.fuzzy.membership import FuzzySet
-from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, read_text, shortened
+from nfriction.io.files import shortened
+from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, read_text
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 
@@ -39,8 +40,7 @@ class _Line:
     text: str
 
     def error(self, message: str) -> ValueError:
-        shown = self.text if len(self.text) <= 60 else self.text[:57] + "..."
-        return ValueError(f"line {self.number} ({shown}): {message}")
+        return ValueError(f"line {self.number} ({shortened(self.text, 60)}): {message}")
 
 
 def load_fis(path: str | Path, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBase:
@@ -79,8 +79,12 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
         raise system["NumRules"].error(f"but [Rules] has {len(lines)} lines.")
     rules = [rule for line in lines for rule in _rules(line, system, inputs, outputs)]
     name = _quoted(system["Name"]) if "Name" in system else ""
-    both = (tuple(one.variable for one in of) for of in (inputs, outputs))
-    return RuleBase(name, *both, tuple(rules))
+    return RuleBase(
+        name,
+        tuple(one.variable for one in inputs),
+        tuple(one.variable for one in outputs),
+        tuple(rules),
+    )
 
 
 def _sections(text: str) -> dict[str, dict[str, _Line]]:

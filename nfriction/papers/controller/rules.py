@@ -39,7 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.io.files import numbers, parse_json
+from nfriction.io.files import numbers, parse_json, shortened
 from nfriction.plant.base import check_keys
 
 FORMAT = "nfriction-rules/1"
@@ -308,12 +308,6 @@ def _number(value: Any, where: str) -> float:
     if isinstance(value, list):
         raise ValueError(f"{where}: expected a number, got {reprlib.repr(value)}.")
     return float(numbers(where, value))
-
-
-def shortened(error: ValueError) -> str:
-    """An error's message, which may quote a name of any length."""
-    text = str(error)
-    return text if len(text) <= 500 else text[:497] + "..."
 
 
 def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, ...]) -> None:

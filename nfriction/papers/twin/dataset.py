@@ -310,12 +310,12 @@ def write(twin: Twin, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for label, recording in twin.recordings.items():
-        file, (q0, qd0) = f"{label}.csv.gz", twin.initial_states[label]
-        recording.write(folder / file)
+        name, (q0, qd0) = f"{label}.csv.gz", twin.initial_states[label]
+        recording.write(folder / name)
         rows.append(
             {
                 "id": label,
-                "file": file,
+                "file": name,
                 "split": twin.splits[label],
                 "n": len(recording),
                 "duration_s": recording.duration,
