@@ -215,7 +215,16 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
     """
     content = read_model_file(path)
     with _naming(path):
-        model = _named_model(content) if into is None else into
+        name, names = content["model"], (*model_names(), *memory_names())
+        if into is None and name not in names:
+            raise ValueError(
+                f"{shortened(repr(name), 80)} is none of the named models ({', '.join(names)}); "
+                "create the model yourself and pass it as `into`."
+            )
+        model = into
+        if model is None:
+            joints, v_smooth = content["joints"], content["v_smooth"]
+            model = model_by_name(name)(joints, v_smooth=v_smooth, **content["options"])
         _check_same_model(content, model)
         given, expected = content["state"], model.state_dict()
         if given.keys() != expected.keys():
@@ -314,17 +323,6 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 def _info(content: Mapping[str, Any]) -> ModelInfo:
     return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
-
-
-def _named_model(content: Mapping[str, Any]) -> FrictionModel:
-    name, names = content["model"], (*model_names(), *memory_names())
-    if name not in names:
-        raise ValueError(
-            f"{shortened(repr(name), 80)} is none of the named models ({', '.join(names)}); create "
-            "the model yourself and pass it as `into`."
-        )
-    make = model_by_name(name)
-    return make(content["joints"], v_smooth=content["v_smooth"], **content["options"])
 
 
 def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:

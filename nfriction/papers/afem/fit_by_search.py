@@ -486,6 +486,7 @@ def fit_by_search(
     result = search(objective.cost, box, options, callback, objective.residuals, negligible)
     table.set_parameter_vector(result.vector)
     names = table.parameter_names(plant.joint_names)
+    residuals = error.residuals(result.vector)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))
     found = FitResult(
         model=model.requires_grad_(False),
@@ -493,15 +494,15 @@ def fit_by_search(
         plant_terms=constant.plant_terms,
         status=("Converged: " if result.converged else "Not converged: ") + result.message,
         converged=result.converged,
-        residual=float(error.mean_square(result.vector[None])[0].sqrt()),
+        residual=error.rms(residuals),
         at_bounds=tuple(n for n, h in zip(names, hit.tolist(), strict=True) if h),
         steps=result.iterations,
         motions=task.motions,
-        residuals=error.residuals(result.vector),
+        residuals=residuals,
     )
     if by_class is None:
         return found
-    baseline = float(error.mean_square(objective.mean[None])[0].sqrt())
+    baseline = error.rms(error.residuals(objective.mean))
     return by_class.backtracked(found, windows, baseline)
 
 

@@ -109,7 +109,7 @@ class EvidenceResult:
         status: reason for the end; `message` gives it in words.
         w: parameters in one vector, shape (p,).
         alpha, gamma: prior precision and effective parameters, by group.
-        beta: noise precision; the noise has the standard deviation `noise_std`.
+        beta: noise precision; the noise has the variance 1 / (2 beta), in the targets' unit.
         error_squares: E_D.
         parameter_squares: E_g = sum (w - w0)^2, by group.
         samples: n, number of errors that E_D sums.
@@ -141,11 +141,6 @@ class EvidenceResult:
     def message(self) -> str:
         """The status in words."""
         return MESSAGES[self.status]
-
-    @property
-    def noise_std(self) -> float:
-        """Standard deviation of the noise of an error, in the targets' unit."""
-        return math.sqrt(0.5 / self.beta)
 
 
 def bayesian_regularisation(

@@ -233,7 +233,7 @@ def test_noise_floor_ends_the_fit() -> None:
     assert (fit.status, fit.converged) == ("noise_floor", True)
     rms = math.sqrt(fit.error_squares / fit.samples)
     assert 0 < rms <= 1e-3
-    assert fit.noise_std >= 1e-3
+    assert math.sqrt(0.5 / fit.beta) >= 1e-3
     # Without a floor it goes on, down to the rounding of the targets if need be.
     exact = bayesian_regularisation(copy.deepcopy(model), x, y)
     assert exact.error_squares < 1e-6 * fit.error_squares
