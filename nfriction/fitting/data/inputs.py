@@ -377,9 +377,12 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
         # Steps far above both that enclose them, which are alike; across a gap any is possible.
         step = np.diff(q, axis=0)
+        gap = np.ones(len(step), dtype=bool)
+        for first, last in recording.segments:
+            gap[first:last] = False
         before, at, after = step[:-2], step[1:-1], step[2:]
         height = np.minimum(np.abs(at - before), np.abs(at - after))
-        height[(2 * np.abs(after - before) > height) | _gaps(recording)[1:-1, None]] = 0.0
+        height[(2 * np.abs(after - before) > height) | gap[1:-1, None]] = 0.0
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
         columns = zip(recording.names, far.T, lasting.T, height.T, strict=True)
         for name, peak, jump, high in columns:
@@ -400,14 +403,6 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
             yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
-
-
-def _gaps(recording: Recording) -> NDArray[np.bool_]:
-    """True for steps that lie in no segment, (step,)."""
-    gap = np.ones(len(recording) - 1, dtype=bool)
-    for first, last in recording.segments:
-        gap[first:last] = False
-    return gap
 
 
 def _times(found: Array) -> str:
