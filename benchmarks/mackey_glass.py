@@ -75,7 +75,7 @@ def by_evidence(x: Tensor, y: Tensor, terms: int, starts: int, steps: int) -> Pr
             fit = train_network(
                 anfis, x.unsqueeze(1), y.unsqueeze(1),
                 TrainingOptions(starts=starts, search_steps=search_steps, max_steps=steps),
-            )[0].evidence  # fmt: skip
+            )[0]  # fmt: skip
             if fit.log_evidence > best:
                 best, chosen = fit.log_evidence, anfis
                 found = f"{kind}, {search_steps} search steps, {fit.status}"

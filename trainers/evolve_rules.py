@@ -63,7 +63,7 @@ def train(argv: Sequence[str] | None) -> str:
     judged = _samples(bench.plant, others, joint)
     first = Candidate(
         start, torque_error(start, adaptive.law, samples, adaptive.v_smooth),
-        len(start.rule_base.rules), (),
+        len(start.rule_base.rules),
     )  # fmt: skip
     table = pd.DataFrame(
         [

@@ -54,8 +54,8 @@ def train(argv: Sequence[str] | None) -> str:
         max_steps=given.max_steps, seed=given.seed, starts=given.starts, callback=keep
     )
     model, fits = train_on_samples(law, controllers, samples, units=given.units, options=options)
-    ended = [f"{n}: {f.evidence.message}" for n, f in zip(samples.joint_names, fits, strict=True)]
-    converged = all(f.evidence.converged for f in fits)
+    ended = [f"{n}: {f.message}" for n, f in zip(samples.joint_names, fits, strict=True)]
+    converged = all(f.converged for f in fits)
     fastest, (braking, driving) = samples.x[..., 0].amax(0), samples.x[..., 1].aminmax(dim=0)
     info = ModelInfo(
         joint_names=samples.joint_names,

@@ -22,7 +22,7 @@ from nfriction.codegen.batch import (
 from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule, Program
 from nfriction.codegen.ir import real
-from nfriction.codegen.scalar import Graph, Node, SelfCheckFailed
+from nfriction.codegen.scalar import Node, SelfCheckFailed
 from nfriction.codegen.transform import hoist
 
 LAYOUT = Layout(
@@ -95,7 +95,11 @@ def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
     q, qd, qdd, start, held, *remembered = outputs
     begin, advance = remembered or ((), ())
     joints = len(q)
-    within = _within(graph, q, qd)
+    zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
+    # A number minus itself is zero unless it is NaN or infinite, which compares false.
+    tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
+    tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
+    within = graph.total(tests, "and")
     groups = [start, held, (*q, *qd, *qdd, *law), (within,), begin, advance]
     groups, once = hoist(graph, groups)
     start, held, step, (within,), begin, advance = groups
@@ -109,15 +113,6 @@ def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
         places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
         parameters += 0 if own else len(port.nodes)
     return RolloutProgram(joints, tuple(once), start, held, step, within, begin, advance, places)
-
-
-def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
-    """A test for finite and slow enough states; numbers that are not finite compare false."""
-    zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
-    # A number minus itself is zero unless it is NaN or infinite.
-    tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
-    tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
-    return graph.total(tests, "and")
 
 
 class RolloutDriver(Driver):

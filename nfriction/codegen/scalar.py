@@ -68,34 +68,25 @@ class Node:
 
 # Every scalar operation with its meaning; the emitters know the same ones.
 EVALUATE: dict[str, Callable[..., Any]] = {
+    **{
+        name: getattr(np, name)
+        for name in (
+            *("abs", "sqrt", "exp", "expm1", "log", "log1p", "floor", "ceil", "trunc", "fmod"),
+            *("sin", "cos", "tan", "sinh", "cosh", "tanh", "where"),
+        )
+    },
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,
     "div": np.divide,
     "neg": np.negative,
-    "abs": np.abs,
     "pow": np.power,
-    "fmod": np.fmod,
     "atan2": np.arctan2,
     "max": np.maximum,  # both propagate NaN, as torch does
     "min": np.minimum,
-    "sqrt": np.sqrt,
-    "exp": np.exp,
-    "expm1": np.expm1,
-    "log": np.log,
-    "log1p": np.log1p,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
     "asin": np.arcsin,
     "acos": np.arccos,
     "atan": np.arctan,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "trunc": np.trunc,
     "lt": np.less,
     "le": np.less_equal,
     "eq": np.equal,
@@ -103,7 +94,6 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "and": np.logical_and,
     "or": np.logical_or,
     "not": np.logical_not,
-    "where": np.where,
 }
 
 PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
@@ -274,10 +264,6 @@ def _unsigned(g: Graph, op: str, a: Node, b: Node) -> Node | None:
     return bare if signs == 2 else g.apply("neg", bare)
 
 
-def _neg(g: Graph, a: Node) -> Node | None:
-    return a.args[0] if a.op == "neg" else None
-
-
 def _pow(g: Graph, a: Node, b: Node) -> Node | None:
     if b.op != "constant":
         return None
@@ -334,7 +320,7 @@ _RULES: dict[str, Rule] = {
     "sub": _sub,
     "mul": _mul,
     "div": _div,
-    "neg": _neg,
+    "neg": lambda g, a: a.args[0] if a.op == "neg" else None,
     "pow": _pow,
     "where": _where,
     "and": _logical(False),

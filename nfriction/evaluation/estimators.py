@@ -39,8 +39,6 @@ except ImportError:
 
 
 Array = NDArray[np.float64]
-# One recording, its file or its table, see `Recording.of`.
-Sample = RecordingLike
 # Settings of `fit` that are no matter of one call.
 SETTINGS = {
     name: parameter
@@ -96,7 +94,9 @@ class FrictionEstimator(BaseEstimator):
 
     fit_: FitResult
 
-    def fit(self, X: Sample | Sequence[Sample], y: object = None) -> "FrictionEstimator":
+    def fit(
+        self, X: RecordingLike | Sequence[RecordingLike], y: object = None
+    ) -> "FrictionEstimator":
         """Estimate from recordings.
 
         Args:
@@ -146,7 +146,10 @@ class FrictionEstimator(BaseEstimator):
         return schedule.coefficient_sets()["always"].numpy().copy()
 
     def predict(
-        self, X: Sample | ArrayLike, qdd: ArrayLike | None = None, load: ArrayLike | None = None
+        self,
+        X: RecordingLike | ArrayLike,
+        qdd: ArrayLike | None = None,
+        load: ArrayLike | None = None,
     ) -> Array:
         """Friction torque along a motion.
 
@@ -193,7 +196,7 @@ class FrictionEstimator(BaseEstimator):
                 return model.torque(velocity, loads, held).numpy()
             return model(velocity, acceleration, loads).numpy()
 
-    def simulate(self, recording: Sample) -> pd.DataFrame:
+    def simulate(self, recording: RecordingLike) -> pd.DataFrame:
         """The motion that the model predicts from a recording's lead-in and torques.
 
         Returns:
@@ -209,7 +212,7 @@ class FrictionEstimator(BaseEstimator):
         table.iloc[:, 1:] = run.simulated
         return table
 
-    def score(self, X: Sample | Sequence[Sample], y: object = None) -> float:
+    def score(self, X: RecordingLike | Sequence[RecordingLike], y: object = None) -> float:
         """Minus the root mean square position error of simulations [rad; m of a sliding axis].
 
         Simulations last `horizon` seconds (a recording where that is shorter) and are restarted
@@ -259,7 +262,7 @@ _own = list(inspect.signature(FrictionEstimator.__init__).parameters.values())[:
 FrictionEstimator.__init__.__signature__ = inspect.Signature([*_own, *SETTINGS.values()])  # type: ignore[attr-defined]
 
 
-def _recordings(X: Sample | Sequence[Sample], plant: Plant) -> list[Recording]:
+def _recordings(X: RecordingLike | Sequence[RecordingLike], plant: Plant) -> list[Recording]:
     """Recordings of any accepted form; a table without a unit is in the plant's."""
     if not (found := Recording.many(X, plant=plant)):
         raise ValueError(f"recordings are needed, one or a list of them, got {X!r}.")

@@ -124,6 +124,12 @@ class TorqueFits:
             return list(self.chosen.values())
         return [self._known(model)] * len(self.table.joints)
 
+    def _models(self, model: str | None) -> list[SavedModel]:
+        """The model of each joint, as `_names`."""
+        pairs = zip(self.table.joint_names, self._names(model), strict=True)
+        return [SavedModel(joint, self.table.unit, self.fits[name][k].model)
+                for k, (joint, name) in enumerate(pairs)]  # fmt: skip
+
     def info(self, name: str) -> ModelInfo:
         """Entries of the model file of a model of all joints."""
         found = self.fits[self._known(name)]
@@ -164,19 +170,12 @@ class TorqueFits:
         """
         given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
-        names = self._names(model)
-        return [
-            predict(self.fits[name][k].model, joint).numpy()
-            for k, (name, joint) in enumerate(zip(names, given.joints, strict=True))
-        ]
+        pairs = zip(self._models(model), given.joints, strict=True)
+        return [predict(one.model, joint).numpy() for one, joint in pairs]
 
     def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
-        given = as_table(table, unit=self.table.unit)
-        torques = self.predict(given, model)
-        models = [self.fits[name][k].model for k, name in enumerate(self._names(model))]
-        pairs = zip(given.joints, torques, models, strict=True)
-        return scores_frame([score_joint(*pair) for pair in pairs])
+        return score_models(self._models(model), as_table(table, unit=self.table.unit))
 
     def to_frame(self) -> pd.DataFrame:
         """NRMSE on blocks left out by joint and model."""
@@ -301,7 +300,10 @@ def fit_torque(
             that could be fitted; the message names the remedy.
     """
     given = as_table(table, **reading)
-    names = [models] if isinstance(models, str) else list(models or _laws_for(given))
+    time = all(joint.time is not None for joint in given.joints)
+    load = all(joint.load is not None for joint in given.joints)
+    laws = (*LAWS, *WITH_TIME * time, *WITH_LOAD * load, *WITH_BOTH * (time and load))
+    names = [models] if isinstance(models, str) else list(models or laws)
     names = [name for text in names for name in text.split(",")]
     names = list(dict.fromkeys(map(model_name, names)))
     if folds < 2:
@@ -330,14 +332,6 @@ def fit_torque(
         name, why = _choose(of)
         choices[joint] = name, f"{why}{fits[name][k].note}"
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
-
-
-def _laws_for(table: TorqueTable) -> tuple[str, ...]:
-    """Constant laws that the columns of a table allow."""
-    time = all(joint.time is not None for joint in table.joints)
-    load = all(joint.load is not None for joint in table.joints)
-    found = (LAWS, WITH_TIME * time, WITH_LOAD * load, WITH_BOTH * (time and load))
-    return tuple(name for names in found for name in names)
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
@@ -430,13 +424,13 @@ def _fit(
     return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
 
 
-def score_joint(joint: JointTorque, torque: Array, model: FrictionModel) -> TorqueScore:
-    """Error of a torque that a model of one joint predicts at the rows of a joint.
+def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
+    """Error of the torque that a model of one joint predicts at the rows of a joint.
 
     The lead-in of a law with memory is not scored, because its torque was read. A ripple that is
     out of phase with the rows is logged.
     """
-    rows = slice(None)
+    torque, rows = predict(model, joint).numpy(), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # Scoring them would reward reading the answer.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
@@ -452,16 +446,8 @@ def score_joint(joint: JointTorque, torque: Array, model: FrictionModel) -> Torq
     return TorqueScore(joint.name, type(model).__name__, rmse, nrmse)
 
 
-def scores_frame(scores: Sequence[TorqueScore]) -> pd.DataFrame:
-    """Scores as a table, a row a joint."""
-    import pandas as pd  # slow to import
-
-    return pd.DataFrame(scores).set_index("joint")
-
-
-@dataclass(frozen=True, eq=False)
-class SavedModel:
-    """A model of one joint from a file."""
+class SavedModel(NamedTuple):
+    """A model of one joint, from a fit or from a file."""
 
     joint: str
     unit: Unit
@@ -510,13 +496,11 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     Raises:
         ValueError: if the table's joints are others, or it lacks a load that a model needs.
     """
+    import pandas as pd  # slow to import
+
     _check_joints([one.joint for one in models], table)
-    return scores_frame(
-        [
-            score_joint(joint, predict(one.model, joint).numpy(), one.model)
-            for one, joint in zip(models, table.joints, strict=True)
-        ]
-    )
+    pairs = zip(models, table.joints, strict=True)
+    return pd.DataFrame([score_joint(joint, one.model) for one, joint in pairs]).set_index("joint")
 
 
 def split(model: FrictionModel) -> list[FrictionModel]:

@@ -44,6 +44,7 @@ class ControllerC:
 
     real: Real = "double"  # type of all numbers
     prefix: str = "nfriction"  # of every name in the file, for which templates write `nf`
+    templates: tuple[str, ...] = ("nfriction.export", "templates")  # package, folders in it
 
     def literal(self, value: float | bool) -> str:
         """A number as C spells it, in brackets where it is negative."""
@@ -135,7 +136,8 @@ class ControllerC:
 
 @cache
 def _templates(dialect: ControllerC) -> jinja2.Environment:
-    folder = resources.files("nfriction.export").joinpath("templates")
+    package, *inside = dialect.templates
+    folder = resources.files(package).joinpath(*inside)
 
     def load(name: str) -> str:
         return dialect.own(folder.joinpath(name).read_text("ascii"))

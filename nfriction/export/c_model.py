@@ -109,7 +109,14 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
     elif form == "traced":
         words["schedule"] = _schedule(controller, dialect)
     elif form == "adaptive":
-        _add_classes(model.schedule, values, words, dialect)
+        adaptive: Any = model.schedule
+        borders = adaptive.thresholds.mT
+        values |= {
+            "middle": borders, "upper": borders * adaptive.band, "lower": borders / adaptive.band,
+            "swing_rate": adaptive.swing_rate, "ceiling": adaptive.ceiling * borders[1],
+            "by_class": adaptive.table().permute(1, 2, 0),
+        }  # fmt: skip
+        words["fading"] = dialect.literal(float(adaptive.fading))
     if network:
         _add_network(model.schedule, values, words, dialect)
         if words["along_motion"]:
@@ -121,19 +128,6 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
         tanhs = len(signs) if words["array_tanh"] else 0
         words["exponential"] = exponential(dialect, controller.joints, tanhs)
     return {**words, "signs": signs}
-
-
-def _add_classes(
-    adaptive: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
-) -> None:
-    """Tables of the classes of acceleration."""
-    borders = adaptive.thresholds.mT
-    values |= {
-        "middle": borders, "upper": borders * adaptive.band, "lower": borders / adaptive.band,
-        "swing_rate": adaptive.swing_rate, "ceiling": adaptive.ceiling * borders[1],
-        "by_class": adaptive.table().permute(1, 2, 0),
-    }  # fmt: skip
-    words["fading"] = dialect.literal(float(adaptive.fading))
 
 
 def _add_network(

@@ -169,12 +169,8 @@ def _where(g: OnnxGraph, condition: Any, a: Any, b: Any) -> Value:
 def _cast(g: OnnxGraph, a: Value, dtype: torch.dtype | None = None, **_: Any) -> Value:
     if dtype is None or dtype == a.dtype:
         return a
-    return g.emit("Cast", a, dtype=dtype, to=_onnx_type(g, dtype))
-
-
-def _onnx_type(g: OnnxGraph, dtype: torch.dtype) -> int:
     kind = g.real if dtype.is_floating_point else torch.zeros((), dtype=dtype).numpy().dtype
-    return int(g.helper.np_dtype_to_tensor_dtype(kind))
+    return g.emit("Cast", a, dtype=dtype, to=int(g.helper.np_dtype_to_tensor_dtype(kind)))
 
 
 def _slice(

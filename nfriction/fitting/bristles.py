@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, path_of, range_of
+from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, path_of, range_of, weights
 from nfriction.friction.laws import Law
 from nfriction.friction.memory import states_along
 from nfriction.recording.torque_table import JointTorque
@@ -168,60 +168,51 @@ def unit_torques(
 
     The damping is taken as it is far below its limit.
     """
-    memory = law.memory
-    assert memory is not None
     linear: list[str] = [n for n in ("F_c", "sigma_1", "F_v", "sigma_2") if n in law.names]
     places = tuple(law.names.index(name) for name in linear)
-    base = torch.zeros(len(shapes), 1, len(law.names)).double()
-    for k, c in enumerate(law.coefficients):
-        # Only those that keep their given value: the others are set below.
-        if c.initial_grid:
-            base[..., k] = c.initial_grid[0]
-    for name in linear[1:]:
-        base[..., law.names.index(name)] = 0.0
-    base[..., places[0]] = 1.0
-    for name, values in zip(shaping, shapes.T, strict=True):
-        base[..., law.names.index(name)] = torch.tensor(values)[:, None]
+    # Only those keep their given value that are set nowhere below.
+    base = np.tile([c.initial_grid[0] if c.initial_grid else 0.0 for c in law.coefficients],
+                   (len(shapes), 1))  # fmt: skip
+    base[:, places[1:]] = 0.0
+    base[:, places[0]] = 1.0
+    base[:, [law.names.index(name) for name in shaping]] = shapes
     along = _states(law, joint, base)
-    shape = along.shape[:-1]
-    velocity = torch.tensor(joint.qd)[:, None].expand(shape)
-    held = base[:, None].expand(*shape, -1)
-
-    def torque(coefficients: Tensor) -> Tensor:
-        return memory.torque(along, velocity, torch.ones(shape).double(), coefficients)[..., 0]
-
-    columns = [torque(held)]
+    columns = [_torques(law, joint, along, base)]
     for place in places[1:]:
-        small = held.clone()
-        small[..., place] = 1e-6
-        columns.append((torque(small) - columns[0]) / 1e-6)
-    return places, torch.stack(columns, -1).numpy()
+        small = base.copy()
+        small[:, place] = 1e-6
+        columns.append((_torques(law, joint, along, small) - columns[0]) / 1e-6)
+    return places, np.stack(columns, -1)
 
 
-def _states(law: Law, joint: JointTorque, coefficients: Tensor) -> Tensor:
-    """Deflections along the rows, (set, row, 1, state), of sets of coefficients (set, 1, ...)."""
+def _states(law: Law, joint: JointTorque, coefficients: Array) -> Tensor:
+    """Deflections along the rows, (set, row, 1, state), of sets of coefficients (set, name)."""
     assert law.memory is not None
     assert joint.time is not None
     step = torch.tensor(np.diff(joint.time, prepend=joint.time[0] - joint.step))
     moved = torch.tensor(path_of(joint)) / step
     load = load_of(joint)[:, None]
-    start = coefficients.new_zeros((*coefficients.shape[:-1], law.memory.size))
+    given = torch.tensor(coefficients)[:, None]
+    start = given.new_zeros((*given.shape[:-1], law.memory.size))
     along = states_along(
-        law.memory, start, moved[:, None], load, coefficients.expand(len(moved), -1, -1, -1), step
+        law.memory, start, moved[:, None], load, given.expand(len(moved), -1, -1, -1), step
     )
     return along.transpose(0, 1)
 
 
+def _torques(law: Law, joint: JointTorque, along: Tensor, coefficients: Array) -> Array:
+    """Torque at deflections along the rows, (set, row), of sets of coefficients (set, name)."""
+    assert law.memory is not None
+    shape = along.shape[:-1]
+    qd = torch.tensor(joint.qd)[:, None].expand(shape)
+    held = torch.tensor(coefficients)[:, None, None].expand(*shape, -1)
+    found: Array = law.memory.torque(along, qd, torch.ones(shape).double(), held)[..., 0].numpy()
+    return found
+
+
 def torques(law: Law, joint: JointTorque, coefficients: Array) -> Array:
     """Torque along the rows, (set, row), of sets of coefficients (set, coefficient)."""
-    assert law.memory is not None
-    given = torch.tensor(coefficients)[:, None]
-    states = _states(law, joint, given)
-    shape = states.shape[:-1]
-    qd = torch.tensor(joint.qd)[:, None].expand(shape)
-    held = given[:, None].expand(*shape, -1)
-    found: Array = law.memory.torque(states, qd, torch.ones(shape).double(), held)[..., 0].numpy()
-    return found
+    return _torques(law, joint, _states(law, joint, coefficients), coefficients)
 
 
 def refined(law: Law, joint: JointTorque, start: Array) -> tuple[Array, Array, Array, list[int]]:
@@ -269,11 +260,5 @@ def _linearised(
 
 def _forces(gram: Array, right: Array) -> tuple[Array, float]:
     """Forces, none negative, and the sum of squares but for that of the torque."""
-    from scipy.optimize import nnls  # slow to import
-
-    scale = np.sqrt(np.diag(gram))
-    scale[scale <= 0] = 1.0
-    a = gram / scale[:, None] / scale + 1e-9 * np.eye(len(right))
-    root = np.linalg.cholesky(a).T
-    solution = nnls(root, np.linalg.solve(root.T, right / scale))[0] / scale
+    solution = weights(gram, right, 1e-9, signed=0)
     return solution, float((solution @ gram - 2 * right) @ solution)

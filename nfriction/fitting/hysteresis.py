@@ -283,10 +283,10 @@ class _Dictionary:
         """
         used = np.array([p for p in choice.places if p >= 0])
         law = used != REST
-        weights = _weights(fold.gram[np.ix_(used, used)], fold.right[used], choice.shape.ridge)
-        torque: Array = self.whole[rows][:, used[law]] @ weights[law]
+        found = weights(fold.gram[np.ix_(used, used)], fold.right[used], choice.shape.ridge)
+        torque: Array = self.whole[rows][:, used[law]] @ found[law]
         if choice.shape.rested:
-            error = self.tau[: self.lead] - self.whole[: self.lead][:, used[law]] @ weights[law]
+            error = self.tau[: self.lead] - self.whole[: self.lead][:, used[law]] @ found[law]
             left = self.whole[: self.lead, REST]
             torque = torque + left @ error / (left @ left) * self.whole[rows, REST]
         return torque
@@ -294,11 +294,11 @@ class _Dictionary:
     def _choice(self, shape: _Shape, places: tuple[int, ...]) -> _Choice:
         used = [p for p in places if p >= 0]
         gram, right = self.gram[np.ix_(used, used)], self.right[used]
-        solution = _weights(gram, right, shape.ridge)
-        weights = np.zeros(len(places))
-        weights[[k for k, p in enumerate(places) if p >= 0]] = solution
+        solution = weights(gram, right, shape.ridge)
+        every = np.zeros(len(places))
+        every[[k for k, p in enumerate(places) if p >= 0]] = solution
         # But for the square of the torque, which is the same for all.
-        return _Choice(shape, places, weights, float((solution @ gram - 2 * right) @ solution))
+        return _Choice(shape, places, every, float((solution @ gram - 2 * right) @ solution))
 
     def result(
         self, choice: _Choice, widths: Array, errors: Sequence[float], start: float
@@ -329,10 +329,10 @@ class _Dictionary:
         return MemoryFit(coefficients, tuple(errors), torque, design[:, own], fitted)
 
 
-def _weights(gram: Array, right: Array, ridge: float) -> Array:
+def weights(gram: Array, right: Array, ridge: float, signed: int = 1) -> Array:
     """Weights of columns with these products, by least squares with a ridge.
 
-    None is negative but the offset, the first.
+    None is negative but those of the first `signed` columns, by default of the offset's.
     """
     from scipy.optimize import nnls  # slow to import
 
@@ -340,8 +340,8 @@ def _weights(gram: Array, right: Array, ridge: float) -> Array:
     scale[scale <= 0] = 1.0
     root = np.linalg.cholesky(gram / scale[:, None] / scale + ridge * np.eye(len(right))).T
     target = np.linalg.solve(root.T, right / scale)
-    # The offset's column once more, reversed.
-    both, _ = nnls(np.c_[root, -root[:, :1]], target, maxiter=50 * len(right))
-    weights: Array = both[:-1]
-    weights[0] -= both[-1]
-    return weights / scale
+    # The signed columns once more, reversed.
+    both, _ = nnls(np.c_[root, -root[:, :signed]], target, maxiter=50 * len(right))
+    found: Array = both[: len(right)]
+    found[:signed] -= both[len(right) :]
+    return found / scale

@@ -103,8 +103,13 @@ def prepare_task(
     require_drive(model.law, joint)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
-    per_recording = _zeroed_per_recording(plant, given, options)
-    guessed = per_recording and options.encoder_reference == "auto"
+    guessed = (
+        options.encoder_reference == "auto"
+        # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
+        and options.method == "output_error"
+        and looks_zeroed_per_recording(plant, given, options)
+    )
+    per_recording = guessed or options.encoder_reference == "per_recording"
     convention = given[0].resolve_convention(plant)
     delay = 0.0
     if options.fit_delay:
@@ -134,14 +139,6 @@ def prepare_task(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, tuple(m.text for m in mistakes), unmodelled,
     )  # fmt: skip
-
-
-def _zeroed_per_recording(plant: Plant, given: Sequence[Recording], options: FitOptions) -> bool:
-    """True if encoders were set to zero at the start of each recording, or seem to have been."""
-    if options.encoder_reference != "auto":
-        return options.encoder_reference == "per_recording"
-    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
-    return options.method == "output_error" and looks_zeroed_per_recording(plant, given, options)
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:

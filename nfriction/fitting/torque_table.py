@@ -105,7 +105,9 @@ def fit_joint(
             f"coefficients of {name}; measure at more velocities."
         )
     require_load(name, joint)
-    part = _balance(joint)
+    qd, _, load, tau = _columns(joint)
+    kept = torch.ones_like(qd, dtype=torch.bool)
+    part = TorqueBalance(qd, load, tau, kept, None, joint.step, [(0, len(joint) - 1)])
     found = regress(law, [part], v_smooth, options)
     schedule: Any = model.schedule
     values = found.coefficients
@@ -113,15 +115,15 @@ def fit_joint(
         schedule.set_parameter_vector(values.reshape(-1))
         lower, upper = schedule.bounds()
         names = schedule.parameter_names([joint.name])
-        kept = (lower < upper).nonzero().flatten()
+        free = (lower < upper).nonzero().flatten()
         known = Information(found.information[0], torch.zeros(len(names)).double())
-        own = known.subset(kept)
+        own = known.subset(free)
         part_root = covariance_root(own)
-        root = torch.zeros(len(names), len(kept)).double()
-        root[kept] = part_root
-        fitted = [names[i] for i in kept.tolist()]
+        root = torch.zeros(len(names), len(free)).double()
+        root[free] = part_root
+        fitted = [names[i] for i in free.tolist()]
         intervals = confidence_intervals(
-            fitted, values[0][kept], part_root.norm(dim=1), lower[kept], upper[kept]
+            fitted, values[0][free], part_root.norm(dim=1), lower[free], upper[free]
         )
         unknown = null_directions(fitted, own)
     else:
@@ -238,25 +240,25 @@ def fit_memory(
     return fit, found.errors
 
 
-def predict(model: FrictionModel, joint: JointTorque, lead_in: float = LEAD_IN) -> Tensor:
+def predict(model: FrictionModel, joint: JointTorque) -> Tensor:
     """Friction torque of a model of one joint at the rows of a table, (row,) [N m; N].
+
+    The torque of the lead-in shows a law with memory how far it was deflected before.
 
     Args:
         model: of one joint.
         joint: rows; in order of time for a law with memory.
-        lead_in: time from the first row [s] whose torque shows a law with memory how far it was
-            deflected before; 0 begins without deflection.
     """
     require_load(type(model).__name__, joint, model)
     if model.law.memory is not None:
-        return _remembered(model, model.law.memory, joint, lead_in)
+        return _remembered(model, model.law.memory, joint)
     with torch.no_grad():
         torque: Tensor = model(*_columns(joint)[:3])[:, 0]
         return torque
 
 
 @torch.no_grad()
-def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_in: float) -> Tensor:
+def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque) -> Tensor:
     """Torque of a law with memory along rows in order of time."""
     if joint.time is None:
         raise ValueError(f"a law with memory needs the time of the rows of {joint.name}.")
@@ -273,7 +275,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
 
     still = torch.zeros(1, 1, memory.size).double()
     # A table to predict may have no torque, which then shows nothing.
-    seen = lead_in if bool(tau.isfinite().all()) else 0.0
+    seen = LEAD_IN if bool(tau.isfinite().all()) else 0.0
     first = slice(int(np.searchsorted(joint.time, joint.time[0] + seen)))
     if first.stop:
         names, reach = model.law.names, max(range_of(joint), 1e-12)
@@ -354,12 +356,6 @@ def _columns(joint: JointTorque) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     load = np.ones_like(joint.qd) if joint.load is None else joint.load
     qd, qdd, load_, tau = (torch.tensor(x)[:, None] for x in (joint.qd, joint.qdd, load, joint.tau))
     return qd, qdd, load_, tau
-
-
-def _balance(joint: JointTorque) -> TorqueBalance:
-    qd, _, load, tau = _columns(joint)
-    kept = torch.ones_like(qd, dtype=torch.bool)
-    return TorqueBalance(qd, load, tau, kept, None, joint.step, [(0, len(joint) - 1)])
 
 
 def _range(joint: JointTorque, options: FitOptions) -> tuple[float, list[float]]:

@@ -109,8 +109,7 @@ class LinearOutputModule(GroupedModule):
         """Maps of the trained parameters from their first columns and entries from there on."""
         maps = {}
         for name, value in self.named_parameters():
-            # Under `torch.func.functional_call` a plain tensor replaces each trained parameter.
-            if value.requires_grad or not isinstance(value, nn.Parameter):
+            if value.requires_grad:
                 start, block = blocks[name]
                 shape = (self.groups, self.outputs, columns, block.shape[-1])
                 maps[name] = block.new_zeros(shape)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from itertools import pairwise
 
 import torch
@@ -82,26 +83,14 @@ def triangle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return trapezoid(x, a, b, b, c)
 
 
-SHAPES: dict[str, tuple[str, ...]] = {
-    "gaussian": ("centre", "sigma"),
-    "left_shoulder": ("centre", "sigma"),
-    "right_shoulder": ("centre", "sigma"),
-    "two_sided_gaussian": ("left", "left_sigma", "right", "right_sigma"),
-    "bell": ("centre", "width", "slope"),
-    "triangle": ("a", "b", "c"),
-    "trapezoid": ("a", "b", "c", "d"),
-}
-"""Names of the shapes a `FuzzySet` may have, and of their parameters in order."""
-
 _FUNCTIONS: dict[str, Callable[..., Tensor]] = {
-    "gaussian": gaussian,
-    "left_shoulder": left_shoulder,
-    "right_shoulder": right_shoulder,
-    "two_sided_gaussian": two_sided_gaussian,
-    "bell": bell,
-    "triangle": triangle,
-    "trapezoid": trapezoid,
+    function.__name__: function
+    for function in (
+        *(gaussian, left_shoulder, right_shoulder, two_sided_gaussian, bell, triangle, trapezoid),
+    )
 }
+SHAPES = {name: (*signature(of).parameters,)[1:] for name, of in _FUNCTIONS.items()}
+"""Names of the shapes a `FuzzySet` may have, and of their parameters in order."""
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,12 @@ def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
         raise ValueError(f"`{name}` is too large: {str(given)[:40]}.") from None
 
 
+def shortened(text: object, most: int = 500) -> str:
+    """A message of bounded length, as it may quote a file."""
+    whole = str(text)
+    return whole if len(whole) <= most else f"{whole[: most - 3]}..."
+
+
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):

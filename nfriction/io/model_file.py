@@ -20,7 +20,14 @@ from torch import Tensor
 
 from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import checked_json, is_intact, numbers, parse_json, write_atomically
+from nfriction.io.files import (
+    checked_json,
+    is_intact,
+    numbers,
+    parse_json,
+    shortened,
+    write_atomically,
+)
 from nfriction.plant import Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.version import __version__
@@ -208,12 +215,21 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
     """
     content = read_model_file(path)
     with _naming(path):
-        model = _named_model(content) if into is None else into
+        name, names = content["model"], (*model_names(), *memory_names())
+        if into is None and name not in names:
+            raise ValueError(
+                f"{shortened(repr(name), 80)} is none of the named models ({', '.join(names)}); "
+                "create the model yourself and pass it as `into`."
+            )
+        model = into
+        if model is None:
+            joints, v_smooth = content["joints"], content["v_smooth"]
+            model = model_by_name(name)(joints, v_smooth=v_smooth, **content["options"])
         _check_same_model(content, model)
         given, expected = content["state"], model.state_dict()
         if given.keys() != expected.keys():
-            odd = sorted(given.keys() ^ expected.keys())
-            raise ValueError(f"parameters are missing or not the model's: {_short(odd)}.")
+            odd = shortened(sorted(given.keys() ^ expected.keys()), 80)
+            raise ValueError(f"parameters are missing or not the model's: {odd}.")
         state = {name: _parameter(name, given[name], value) for name, value in expected.items()}
         _check_torque(model, state)
     model.load_state_dict(state)
@@ -251,7 +267,7 @@ def load_plant(path: str | Path) -> Plant:
         try:
             plant = from_dict(rig)
         except _UNFIT as error:
-            raise ValueError(f"`rig` is no mechanism ({_short(error)}).") from error
+            raise ValueError(f"`rig` is no mechanism ({shortened(repr(error), 80)}).") from error
         if plant.joints != joints:
             raise ValueError(f"`rig` has {plant.joints} joints, the model {joints}.")
         return plant
@@ -273,9 +289,8 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError("not a model file of nfriction.")
         if content.get("schema") != SCHEMA:
-            raise ValueError(
-                f"schema {_short(content.get('schema'))} is not {SCHEMA}; another version wrote it."
-            )
+            schema = shortened(repr(content.get("schema")), 80)
+            raise ValueError(f"schema {schema} is not {SCHEMA}; another version wrote it.")
         for key, kind in _ENTRIES.items():
             value = content.get(key)
             # JSON's true is an int to Python.
@@ -310,17 +325,6 @@ def _info(content: Mapping[str, Any]) -> ModelInfo:
     return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
 
 
-def _named_model(content: Mapping[str, Any]) -> FrictionModel:
-    name, names = content["model"], (*model_names(), *memory_names())
-    if name not in names:
-        raise ValueError(
-            f"{_short(name)} is none of the named models ({', '.join(names)}); create "
-            "the model yourself and pass it as `into`."
-        )
-    make = model_by_name(name)
-    return make(content["joints"], v_smooth=content["v_smooth"], **content["options"])
-
-
 def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
     names = [c.get("name") if isinstance(c, dict) else None for c in content["coefficients"]]
     pairs = {
@@ -333,9 +337,8 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
     # By key, so that the message names the first difference; as JSON, where true is not 1.
     for key, (ours, theirs) in pairs.items():
         if json.dumps(ours, sort_keys=True) != json.dumps(theirs, sort_keys=True):
-            raise ValueError(
-                f"`{key}` is {_short(ours)} in the file, {_short(theirs)} in the model."
-            )
+            ours, theirs = (shortened(repr(x), 80) for x in (ours, theirs))
+            raise ValueError(f"`{key}` is {ours} in the file, {theirs} in the model.")
 
 
 def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
@@ -366,11 +369,6 @@ def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
     return value
 
 
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
 def _check_depth(content: list[Any]) -> None:
     """Refuse content nested too deeply to be copied and written again."""
     for _ in range(DEEPEST):
@@ -390,4 +388,4 @@ def _check_sizes(content: Mapping[str, Any], size: int) -> None:
     sound = all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes)
     # Each rule and each unit has at least one number in the file.
     if not sound or joints > MOST_JOINTS or joints * max(sizes[1], math.prod(terms)) > size:
-        raise ValueError(f"a network of sizes {_short(sizes)} is refused.")
+        raise ValueError(f"a network of sizes {shortened(repr(sizes), 80)} is refused.")

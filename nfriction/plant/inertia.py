@@ -56,42 +56,9 @@ def _warn_impossible(rows: Tensor) -> None:
         )
 
 
-class _Poses:
-    """M^-1 of a chain with certain values of its buffers over a grid of poses."""
-
-    def __init__(self, plant: Any, values: Tensor) -> None:
-        mass = plant.mass_matrix(configuration_grid(plant.joints).to(values))
-        self.values = values
-        self.inverse = torch.linalg.inv(mass).reshape(-1, *mass.shape[-3:])
-        self.squares = self.inverse.square().flatten(-2)
-        self._damping: Tensor | None = None
-        self._rate = values.new_zeros(())
-
-    def fastest_mode(self, damping: Tensor) -> Tensor:
-        """Largest eigenvalue of M^-1 D, with D diagonal, (batch, 1, joint), and not negative."""
-        # A search asks again and again for the same slopes.
-        if self._damping is None or not torch.equal(damping, self._damping):
-            self._damping, self._rate = damping, self._largest(damping.mT * damping)
-        return self._rate
-
-    def _largest(self, products: Tensor) -> Tensor:
-        """The eigenvalue for products of the entries of D, (batch, joint, joint)."""
-        # D^1/2 M^-1 D^1/2 has the same eigenvalues, and is symmetric: its Frobenius norm bounds
-        # them, so that few poses need theirs.
-        bound = (self.squares @ products.flatten(-2).unsqueeze(-1)).squeeze(-1)
-        scale = products.sqrt().expand(len(bound), -1, -1)
-        inverse = self.inverse.expand(len(bound), -1, -1, -1)
-
-        def largest(where: Tensor) -> Tensor:
-            batch, pose = where.nonzero(as_tuple=True)
-            return torch.linalg.eigvalsh(inverse[batch, pose] * scale[batch]).amax()
-
-        least = largest(bound == bound.amax())
-        return largest(bound >= (least * (1 - 1e-9)).square())
-
-
-# Kept, as every rollout needs them and the grid costs as much as thousands of compiled steps.
-_poses: WeakKeyDictionary[Any, _Poses] = WeakKeyDictionary()
+# M^-1 over the grid, behind the values of the buffers that it belongs to. Kept, as every rollout
+# needs it and it costs as much as thousands of compiled steps.
+_known: WeakKeyDictionary[Any, tuple[Tensor, Tensor]] = WeakKeyDictionary()
 
 
 def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
@@ -100,11 +67,26 @@ def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
     `damping` is the diagonal of D, not negative, (joint,) or (*batch of the plant, joint).
     """
     values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
+    known = _known.get(plant)
     # Buffers may be changed in place, so the values decide and not the object.
-    known = _poses.get(plant)
-    if known is None or not torch.equal(known.values, values):
-        known = _poses[plant] = _Poses(plant, values)
-    return known.fastest_mode(damping.reshape(-1, 1, plant.joints))
+    if known is None or not torch.equal(known[0], values):
+        mass = plant.mass_matrix(configuration_grid(plant.joints).to(values))
+        poses = torch.linalg.inv(mass).reshape(-1, *mass.shape[-3:])
+        known = _known[plant] = values, poses
+    damping = damping.reshape(-1, 1, plant.joints)
+    products = damping.mT * damping
+    # D^1/2 M^-1 D^1/2 has the same eigenvalues, and is symmetric: its Frobenius norm bounds them,
+    # so that few poses need theirs.
+    bound = (known[1].square() * products.unsqueeze(1)).sum((-1, -2))
+    scale = products.sqrt().expand(len(bound), -1, -1)
+    inverse = known[1].expand(len(bound), -1, -1, -1)
+
+    def largest(where: Tensor) -> Tensor:
+        batch, pose = where.nonzero(as_tuple=True)
+        return torch.linalg.eigvalsh(inverse[batch, pose] * scale[batch]).amax()
+
+    least = largest(bound == bound.amax())
+    return largest(bound >= (least * (1 - 1e-9)).square())
 
 
 def configuration_grid(joints: int) -> Tensor:

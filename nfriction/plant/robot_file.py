@@ -1,6 +1,5 @@
 """Mechanisms from robot descriptions: URDF, by the standard library, or MuJoCo's MJCF."""
 
-import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -145,15 +144,13 @@ def _body(inertial: Element, link: str, turn: Array, place: Array) -> RigidBody:
 
 def _origin(element: Element, what: str) -> tuple[Array, Array]:
     """Rotation and shift of an element's `origin`."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
     given = element.find("origin")
     what = f"origin of the {what}"
-    roll, pitch, yaw = _numbers(given, "rpy", what, "0 0 0").tolist()
-    sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
-    sy, cy = math.sin(yaw), math.cos(yaw)
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x, _numbers(given, "xyz", what, "0 0 0")
+    # Roll, pitch and yaw are about the axes that stay, which lower-case letters mean.
+    turn = Rotation.from_euler("xyz", _numbers(given, "rpy", what, "0 0 0"))
+    return turn.as_matrix(), _numbers(given, "xyz", what, "0 0 0")
 
 
 def _numbers(

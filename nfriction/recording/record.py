@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.io import formats
+from nfriction.io.files import shortened
 from nfriction.recording.angles import AngleConvention, ConventionLike, Mechanism
 from nfriction.recording.validation import check, doubts, gaps, is_uniform, read_only
 
@@ -368,10 +369,7 @@ class Recording:
                 plant=plant,
             )
         except ValueError as error:
-            reason = str(error)
-            # It may quote the file.
-            reason = reason if len(reason) <= 2000 else f"{reason[:1997]}..."
-            raise ValueError(f"'{path}': {reason}") from error
+            raise ValueError(f"'{path}': {shortened(error, 2000)}") from error
 
     @classmethod
     def of(

@@ -203,8 +203,14 @@ class TorqueTable:
             parts.append({key: None if x is None else x[rows] for key, x in found.items()})
         remarks: list[str] = []
         joints = [_joint(*pair, remarks) for pair in zip(names, parts, strict=True)]
-        if unit == "rad":
-            remarks += filter(None, map(_wrapped, joints))
+        for joint in joints:
+            if unit == "rad" and joint.q is not None and joint.time is not None:
+                (jumps,) = turns_between_samples(joint.q[:, None], np.empty(0, dtype=np.intp))
+                if jumps:
+                    remarks.append(
+                        f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, "
+                        "unwrap it with `numpy.unwrap`."
+                    )
         if unit == "rad" and not degrees:
             fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
             if fast:
@@ -260,19 +266,6 @@ def _require_unit(unit: Unit, sources: Mapping[_Key, tuple[str, str | None]]) ->
                     f"`unit` is {unit!r}, but column {column} is in {canonical_unit(own)}; read "
                     f"the table with `unit={found!r}` (`--unit {found}`)."
                 )
-
-
-def _wrapped(joint: JointTorque) -> str | None:
-    """A doubt about positions that jump by a turn."""
-    if joint.q is None or joint.time is None:
-        return None
-    (jumps,) = turns_between_samples(joint.q[:, None], np.empty(0, dtype=np.intp))
-    if not jumps:
-        return None
-    return (
-        f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, unwrap it with "
-        "`numpy.unwrap`."
-    )
 
 
 def _key(name: str) -> _Key | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -125,39 +125,35 @@ def _check_stamps(time: Array) -> None:
         )
 
 
-def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple[str, str]]:
+def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[tuple[str, str]]:
     """Signs that units or stamps are wrong, each with its remedy."""
-    found = []
     step = np.diff(time)
     pauses = gaps(time)
     # A joint's motion cannot be seen at two samples a second.
     slow = bool(np.median(step) >= 0.5)
     if slow:
-        remedy = 'if so, divide it by 1000, or read it with columns={"time": "time:ms"}'
-        found.append(("`time` looks like milliseconds", remedy))
+        yield (
+            "`time` looks like milliseconds",
+            'if so, divide it by 1000, or read it with columns={"time": "time:ms"}',
+        )
     if len(pauses):
         k = int(pauses[np.argmax(step[pauses])])
-        found.append(
-            (
-                f"`time` has gaps ({len(pauses)}), the longest of {step[k]:.4g} s at "
-                f"{time[k]:.6g} s",
-                "no simulation crosses them; each starts anew behind one",
-            )
+        yield (
+            f"`time` has gaps ({len(pauses)}), the longest of {step[k]:.4g} s at {time[k]:.6g} s",
+            "no simulation crosses them; each starts anew behind one",
         )
     held = held_samples(q)
     if (held > 1).any():
         slow_joints = ", ".join(name for name, n in zip(names, held, strict=True) if n > 1)
         rows = int(held.max())
-        found.append(
-            (
-                f"each position of {slow_joints} is repeated for about {rows} samples, as by a "
-                "sensor that is slower than the log",
-                f"if so, keep the rows with new values, as `recording[::{rows}]` does: repeated "
-                "ones look like a joint that stops and jumps",
-            )
+        yield (
+            f"each position of {slow_joints} is repeated for about {rows} samples, as by a "
+            "sensor that is slower than the log",
+            f"if so, keep the rows with new values, as `recording[::{rows}]` does: repeated "
+            "ones look like a joint that stops and jumps",
         )
     if unit == "m":
-        return found
+        return
     # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and of a whirling chain
     # the first link seldom goes round. So joints that all pass a full turn and one of them 30 rad/s
     # are driven wheels, or in degrees. Wrapped angles never span more than a turn.
@@ -165,24 +161,19 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
     with np.errstate(over="ignore"):  # stamps may be as close as numbers get
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
     if turns > 1 and speed > 30.0 and not slow:
-        found.append(
-            (
-                f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
-                f"times, at up to {speed:.0f} rad/s)",
-                "if so, read it with `degrees=True`, or state the counts of a turn, as in "
-                'columns={"q1": "q1:counts/8192"}',
-            )
+        yield (
+            f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
+            f"times, at up to {speed:.0f} rad/s)",
+            "if so, read it with `degrees=True`, or state the counts of a turn, as in "
+            'columns={"q1": "q1:counts/8192"}',
         )
     jumps = turns_between_samples(q, pauses)
     if jumps.any():
         wrapped = ", ".join(name for name, n in zip(names, jumps, strict=True) if n)
-        found.append(
-            (
-                f"`q` of {wrapped} looks wrapped ({jumps.sum()} jumps of about a turn)",
-                "if so, unwrap it with `numpy.unwrap(q, axis=0)`",
-            )
+        yield (
+            f"`q` of {wrapped} looks wrapped ({jumps.sum()} jumps of about a turn)",
+            "if so, unwrap it with `numpy.unwrap(q, axis=0)`",
         )
-    return found
 
 
 def held_samples(q: Array) -> NDArray[np.intp]:

@@ -47,7 +47,9 @@ def adjoint_rollout(
     None where a gradient would be incomplete: with a hidden state, a law with memory, a sample
     time or measured motion that requires one, or modules that read tensors of others.
     """
-    system = _System(plant, friction, inputs, own_tensors(plant, friction))
+    modules = [m for m in (plant, friction) if isinstance(m, nn.Module)]
+    own = (t for m in modules for t in (*m.parameters(), *m.buffers()) if t.requires_grad)
+    system = _System(plant, friction, inputs, list({id(t): t for t in own}.values()))
     fixed = (inputs.step, *(inputs.measured or ()))
     if as_stateful(friction) or memory_of(friction) or any(x.requires_grad for x in fixed):
         return None
@@ -57,13 +59,6 @@ def adjoint_rollout(
         simulate, system, inputs.q0, inputs.qd0, inputs.tau, *system.tensors
     )
     return states
-
-
-def own_tensors(*modules: Any) -> list[Tensor]:
-    """Parameters and buffers that require a gradient."""
-    found = [m for m in modules if isinstance(m, nn.Module)]
-    tensors = (t for m in found for t in (*m.parameters(), *m.buffers()) if t.requires_grad)
-    return list({id(t): t for t in tensors}.values())
 
 
 def _is_closed(system: "_System") -> bool:

@@ -115,9 +115,13 @@ def validate_inputs(
         step = step.expand(count)
     if torque is None:
         torque = q0.new_zeros(1, 1).expand(count, joints)
-    batch = _common_batch({"q0": q0.shape[:-1], "qd0": qd0.shape[:-1], "tau": torque.shape[:-2],
-                           "sample_time": step.shape[:-1]})  # fmt: skip
-    shape = (*batch, joints)
+    batches = {"q0": q0.shape[:-1], "qd0": qd0.shape[:-1], "tau": torque.shape[:-2],
+               "sample_time": step.shape[:-1]}  # fmt: skip
+    try:
+        shape = (*np.broadcast_shapes(*batches.values()), joints)
+    except ValueError:
+        shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
+        raise ValueError(f"batches must be the same, 1 or left out, got {shown}.") from None
     return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
 
 
@@ -135,14 +139,6 @@ def _step_count(steps: int | None, step: Tensor, torque: Tensor | None) -> int:
     if count < 1:
         raise ValueError("`tau` must have a row for at least one step, got none.")
     return count
-
-
-def _common_batch(batches: dict[str, torch.Size]) -> tuple[int, ...]:
-    try:
-        return np.broadcast_shapes(*batches.values())
-    except ValueError:
-        shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
-        raise ValueError(f"batches must be the same, 1 or left out, got {shown}.") from None
 
 
 def validate_measured(

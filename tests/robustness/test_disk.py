@@ -16,8 +16,6 @@ import pytest
 from nfriction import LFM, ModelInfo, save
 from nfriction.export import torchscript
 from nfriction.io.files import atomic_write, write_atomically
-from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rules import save_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
@@ -41,7 +39,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "run.npz": lambda path: recording().write(path),
     "run.parquet": lambda path: recording().write(path),
     "rig.json": lambda path: rigs.write(rigs.tlrip(), path),
-    "rules.json": lambda path: save_rules(paper_controller(2).rule_base, path),
     "rest.bin": lambda path: write_atomically(path, bytes(10_000)),
 }
 

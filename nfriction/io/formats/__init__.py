@@ -18,7 +18,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from nfriction.io.files import write_atomically
+from nfriction.io.files import shortened, write_atomically
 from nfriction.io.formats.numbers import column_numbers
 from nfriction.io.formats.selection import Arrays, table_arrays
 
@@ -79,11 +79,8 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
     try:
         table: pd.DataFrame = resolve_name(f"{__name__}.{reader}")(path, sources)
     except _BROKEN as error:
-        reason = str(error)
-        # It may quote the file.
-        reason = reason if len(reason) <= 500 else f"{reason[:497]}..."
         raise ValueError(
-            f"'{path}' is truncated, ragged or not what its ending says ({reason}); "
+            f"'{path}' is truncated, ragged or not what its ending says ({shortened(error)}); "
             f"repair or fetch it again."
         ) from error
     return table

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from nfriction.io.files import shortened
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -87,10 +89,9 @@ def column_numbers(table: pd.DataFrame, column: str) -> Array:
         return cells.astype(np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         row = next(row for row, cell in enumerate(cells) if not is_number(cell))
-        shown = repr(cells[row])
         raise ValueError(
             f"column {column}, row {row} (counted from 0 below the header) must be a number, "
-            f"got {shown if len(shown) < 80 else shown[:77] + '...'}."
+            f"got {shortened(repr(cells[row]), 80)}."
         ) from error
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -309,19 +309,20 @@ def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> lis
     return [(finding, remedy)]
 
 
-def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> list[tuple[str, str]]:
+def _remarks(
+    table: pd.DataFrame, sources: dict[str, Source], joints: int
+) -> Iterator[tuple[str, str]]:
     lacking = {
         key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
         for key in ("qd", "tau")
     }
-    remarks = []
     if 0 < len(lacking["qd"]) < joints:
         finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
-        remarks.append((finding, "name or drop those of all joints"))
+        yield finding, "name or drop those of all joints"
     free = lacking["tau"]
     if 0 < len(free) < joints:
         finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
-        remarks.append((finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'))
+        yield finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'
     read = {source.column for source in sources.values()}
     drives = {name: kind for name, kind in _drives(table).items() if name not in read}
     unread = [name for name in drives if f"tau{_number(name)}" not in sources] if free else []
@@ -334,8 +335,7 @@ def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> li
             remedy = "if it drives a joint, give the rig a `motor` with its `torque_constant` "
             remedy += f"and `gear_ratio`, and name the column with {option}"
         finding = f"column {', '.join(unread[:3])} looks like {kind} and is not read"
-        remarks.append((finding, remedy))
-    return remarks
+        yield finding, remedy
 
 
 def _drives(table: pd.DataFrame) -> dict[str, str]:

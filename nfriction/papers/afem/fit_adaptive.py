@@ -268,12 +268,9 @@ class PositionError:
         """Number of position errors."""
         return int(self.windows.weight.sum()) * self.windows.q0.shape[1]
 
-    def mean_square(self, vectors: Tensor) -> Tensor:
-        """Mean square of the error [rad^2] of candidates (m, parameter), shape (m,)."""
-        total = torch.zeros(len(vectors), dtype=torch.float64)
-        for error in self.parts(vectors):
-            total += error.square().sum((1, 2))
-        return total / self.values
+    def rms(self, residuals: Tensor) -> float:
+        """Root mean square of errors as of `residuals` [rad]."""
+        return float((residuals.square().sum() / self.values).sqrt())
 
     def residuals(self, vector: Tensor) -> Tensor:
         """Error of one candidate [rad], (window, step + 1, joint)."""
@@ -401,7 +398,7 @@ class ClassFit:
         for share in SHARES:
             schedule.set_coefficients(flat + share * (table - flat))
             residuals = error.residuals(schedule.parameter_vector())
-            rms = float((residuals.square().sum() / error.values).sqrt())
+            rms = error.rms(residuals)
             if rms <= baseline:
                 part = "" if share == 1.0 else f" {share:g} of the deviations by class is taken."
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)

@@ -182,10 +182,6 @@ class Box:
         vectors[..., free] = x
         return vectors
 
-    def tensor(self, point: Sequence[float]) -> Tensor:
-        """A point of a `SearchState` as a tensor."""
-        return torch.tensor(point, dtype=self.start.dtype)
-
 
 Cost = Callable[[Tensor], Tensor]
 Residuals = Callable[[Tensor], Iterable[Tensor]]
@@ -256,7 +252,7 @@ def _pattern(
     local, trials, poll = None, 0 if residuals is None else len(DAMPINGS), 2 * len(start) + 1
     try:
         if state.evaluations == 0:
-            value = _values(cost, box, box.tensor(state.point)[None])[0]
+            value = _values(cost, box, box.start.new_tensor(state.point)[None])[0]
             state = replace(state, value=float(value), evaluations=1)
         finest = (
             options.tolerance
@@ -272,7 +268,7 @@ def _pattern(
                 message = LIMIT
                 break
             if residuals is not None and (moved or local is None):
-                local = local_quadratic(residuals, box, box.tensor(state.point))
+                local = local_quadratic(residuals, box, box.start.new_tensor(state.point))
             state = _polled(cost, box, state, options.seed, local, negligible)
             state = replace(state, evaluations=state.evaluations + moved * (len(start) + 1))
             if callback(state):
@@ -282,7 +278,7 @@ def _pattern(
         message = STOPPED
     if not math.isfinite(state.value) and message == CONVERGED:
         message = "The cost is finite nowhere that was tried."
-    vector = box.from_unit(box.tensor(state.point))
+    vector = box.from_unit(box.start.new_tensor(state.point))
     return SearchResult(vector, state.value, message == CONVERGED, message, state.iterations)
 
 
@@ -329,7 +325,7 @@ def _polled(
     local: Quadratic | None,
     negligible: float,
 ) -> SearchState:
-    x, last = box.tensor(state.point), box.tensor(state.step)
+    x, last = box.start.new_tensor(state.point), box.start.new_tensor(state.step)
     # A generator of its own per iteration: a resumed search needs no generator state.
     random = torch.Generator().manual_seed(seed * 1_000_003 + state.iterations)
     axes, triangle = torch.linalg.qr(
@@ -378,7 +374,7 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
     from scipy.optimize import minimize  # slow to import
 
     (lower, upper), state = box.ends, options.state
-    vector = box.start if state is None else box.from_unit(box.tensor(state.point))
+    vector = box.start if state is None else box.from_unit(box.start.new_tensor(state.point))
     reference, start = float(cost(vector[None])[0]), box.to_unit(vector)
     # SLSQP returns its last iterate, which need not be the best point that it evaluated.
     least, best, iterations = math.inf, start, 0
@@ -490,6 +486,7 @@ def fit_by_search(
     result = search(objective.cost, box, options, callback, objective.residuals, negligible)
     table.set_parameter_vector(result.vector)
     names = table.parameter_names(plant.joint_names)
+    residuals = error.residuals(result.vector)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))
     found = FitResult(
         model=model.requires_grad_(False),
@@ -497,15 +494,15 @@ def fit_by_search(
         plant_terms=constant.plant_terms,
         status=("Converged: " if result.converged else "Not converged: ") + result.message,
         converged=result.converged,
-        residual=float(error.mean_square(result.vector[None])[0].sqrt()),
+        residual=error.rms(residuals),
         at_bounds=tuple(n for n, h in zip(names, hit.tolist(), strict=True) if h),
         steps=result.iterations,
         motions=task.motions,
-        residuals=error.residuals(result.vector),
+        residuals=residuals,
     )
     if by_class is None:
         return found
-    baseline = float(error.mean_square(objective.mean[None])[0].sqrt())
+    baseline = error.rms(error.residuals(objective.mean))
     return by_class.backtracked(found, windows, baseline)
 
 

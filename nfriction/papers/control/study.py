@@ -216,29 +216,6 @@ def way_up(plant: PendulumChain, friction: FrictionModel | None) -> list[Gains]:
     return gains_along(along, tau[:, 0].numpy(), top, weights(plant.joints))
 
 
-def feedback(
-    plant: PendulumChain,
-    compensation: Compensation | None = None,
-    *,
-    share: float = 1.0,
-    follow: bool = False,
-    way: Sequence[Gains] = (),
-) -> Feedback:
-    """A controller of the rig.
-
-    Args:
-        plant: the rig.
-        compensation: of the arm's friction; None for none.
-        share: of that torque.
-        follow: let the arm follow `reference`, or keep it still.
-        way: the swing-up before it, see `way_up`; without one it starts near upright.
-    """
-    return Feedback(
-        plant, top_gains(plant), way, reference=reference if follow else still,
-        compensation=compensation, share=share,
-    )  # fmt: skip
-
-
 def controlled(
     plant: PendulumChain,
     friction: FrictionModel,
@@ -339,7 +316,10 @@ def run_study(
                 except ValueError as error:
                     logger.warning("%s, %s: %s", task, name, error)
                     continue
-            rows[name] = feedback(plant, given, share=share, follow=follow, way=way)
+            rows[name] = Feedback(
+                plant, top_gains(plant), way, reference=reference if follow else still,
+                compensation=given, share=share,
+            )  # fmt: skip
         found[task] = {}
         for name, run in controlled(plant, friction, rows, seconds=seconds).items():
             way = rows[name].way
@@ -392,11 +372,6 @@ def balance_figure(motions: Mapping[str, Array]) -> Figure:
     below.set_ylabel("largest tilt [mrad]")
     below.set_xlabel("time [s]")
     handles = [asked, *(looks[name].handle for name in shown)]
-    style.legend(figure, handles, ["reference", *(_label(name) for name in shown)])
+    labels = {n: f"{n} compensated" for n in shown} | {NONE: "no compensation"}
+    style.legend(figure, handles, ["reference", *(labels[name] for name in shown)])
     return figure
-
-
-def _label(name: str) -> str:
-    return {NONE: "no compensation", TRUTH: "true friction compensated"}.get(
-        name, f"{name} compensated"
-    )

@@ -71,7 +71,8 @@ def plan_swing_up(
     """
     from scipy.optimize import least_squares  # slow to import
 
-    problem = _Shooting(plant, friction, windows, seconds, sample_time)
+    substeps = 1 if friction is None else required_substeps(plant, friction, sample_time)
+    problem = _Shooting(plant, friction, windows, seconds, sample_time, substeps)
     line = np.linspace(0.0, 1.0, windows + 1)[1:-1, None]
     states = (1.0 - line) * problem.hanging / problem.scale
     most = torque_limit / TORQUE_SCALE
@@ -102,6 +103,7 @@ class _Shooting:
     windows: int
     seconds: float
     sample_time: float
+    substeps: int
 
     @property
     def size(self) -> int:
@@ -137,12 +139,9 @@ class _Shooting:
         driven = torch.zeros(*tau.shape, joints, dtype=torch.float64)
         driven[..., 0] = torch.as_tensor(tau)
         q0, qd0 = torch.as_tensor(states).split(joints, -1)
-        substeps = 1
-        if self.friction is not None:
-            substeps = required_substeps(self.plant, self.friction, self.sample_time)
         run = rollout(
             self.plant, self.friction, q0, qd0, driven,
-            sample_time=self.sample_time, substeps=substeps,
+            sample_time=self.sample_time, substeps=self.substeps,
         )  # fmt: skip
         return torch.cat([run.q, run.qd], -1).numpy(), tau
 

@@ -10,13 +10,11 @@ from nfriction.papers.controller.rules import (
     Rule,
     RuleBase,
     Variable,
-    format_rules,
     load_rules,
     parse_rules,
-    save_rules,
 )
 
 __all__ = [
-    "MamdaniController", "Rule", "RuleBase", "Variable", "controller_surface", "format_rules",
-    "load_fis", "load_rules", "paper_controller", "parse_fis", "parse_rules", "save_rules",
+    "MamdaniController", "Rule", "RuleBase", "Variable", "controller_surface", "load_fis",
+    "load_rules", "paper_controller", "parse_fis", "parse_rules",
 ]  # fmt: skip

@@ -83,7 +83,6 @@ class Candidate:
     controller: MamdaniController
     error: float
     rules: int
-    genes: tuple[float, ...]
 
 
 def evolve(
@@ -117,7 +116,7 @@ def evolve(
     def judged(genes: Sequence[float]) -> Candidate:
         controller = _expressed(start, genes)
         error = torque_error(controller, law, samples, v_smooth)
-        return Candidate(controller, error, len(controller.rule_base.rules), tuple(genes))
+        return Candidate(controller, error, len(controller.rule_base.rules))
 
     own = _genes_of(start)
     reference = judged(own.tolist())

@@ -6,9 +6,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from nfriction.fuzzy.membership import FuzzySet
-from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, read_text, shortened
+from nfriction.io.files import shortened
+from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, read_text
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 
@@ -25,18 +27,11 @@ _TERM = re.compile(r"'([^']*)'\s*:\s*'([^']*)'\s*,\s*\[([^\]]*)\]\s*")
 _RULE = re.compile(r"([-\d\s]+),([-\d\s]+)\(([^()]*)\)\s*:\s*([12])\s*")
 
 
-@dataclass(frozen=True)
-class _FileVariable:
-    """A variable whose sets have the file's order, by which rules refer to them."""
+class _FileVariable(NamedTuple):
+    """A variable, and the names of its sets in the file's order, by which rules refer to them."""
 
-    name: str
-    universe: tuple[float, float]
-    sets: tuple[FuzzySet, ...]
-
-    def ordered(self, unit: str) -> Variable:
-        # Only here: rules of the file count the sets in its own order.
-        ascending = sorted(self.sets, key=lambda term: term.core)
-        return Variable(self.name, unit, self.universe, tuple(ascending))
+    variable: Variable
+    terms: list[str]
 
 
 @dataclass(frozen=True)
@@ -45,8 +40,7 @@ class _Line:
     text: str
 
     def error(self, message: str) -> ValueError:
-        shown = self.text if len(self.text) <= 60 else self.text[:57] + "..."
-        return ValueError(f"line {self.number} ({shown}): {message}")
+        return ValueError(f"line {self.number} ({shortened(self.text, 60)}): {message}")
 
 
 def load_fis(path: str | Path, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBase:
@@ -75,10 +69,11 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
     sections = _sections(text)
     system = sections.get("System", {})
     _check_system(system)
-    inputs = _variables(sections, "Input", _count(system, "NumInputs"))
-    outputs = _variables(sections, "Output", _count(system, "NumOutputs"))
-    if len(units) != len(inputs):
-        raise ValueError(f"`units` needs one for each of {len(inputs)} inputs, got {list(units)}.")
+    count = _count(system, "NumInputs")
+    if len(units) != count:
+        raise ValueError(f"`units` needs one for each of {count} inputs, got {list(units)}.")
+    inputs = _variables(sections, "Input", units)
+    outputs = _variables(sections, "Output", ["1"] * _count(system, "NumOutputs"))
     lines = list(sections.get("Rules", {}).values())
     if len(lines) != _count(system, "NumRules"):
         raise system["NumRules"].error(f"but [Rules] has {len(lines)} lines.")
@@ -86,8 +81,8 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
     name = _quoted(system["Name"]) if "Name" in system else ""
     return RuleBase(
         name,
-        tuple(variable.ordered(unit) for variable, unit in zip(inputs, units, strict=True)),
-        tuple(variable.ordered("1") for variable in outputs),
+        tuple(one.variable for one in inputs),
+        tuple(one.variable for one in outputs),
         tuple(rules),
     )
 
@@ -136,9 +131,11 @@ def _check_system(system: dict[str, _Line]) -> None:
             raise system[key].error(f"{key} must be {method!r}.")
 
 
-def _variables(sections: dict[str, dict[str, _Line]], kind: str, count: int) -> list[_FileVariable]:
+def _variables(
+    sections: dict[str, dict[str, _Line]], kind: str, units: Sequence[str]
+) -> list[_FileVariable]:
     variables = []
-    for index in range(1, count + 1):
+    for index, unit in enumerate(units, 1):
         heading = f"{kind}{index}"
         if heading not in sections:
             raise ValueError(f"section [{heading}] is missing.")
@@ -150,9 +147,11 @@ def _variables(sections: dict[str, dict[str, _Line]], kind: str, count: int) -> 
         low_high = _numbers(section["Range"], section["Range"].text.strip("[]"))
         if len(low_high) != 2:
             raise section["Range"].error("expected [low high].")
-        variables.append(
-            _FileVariable(_quoted(section["Name"]), (low_high[0], low_high[1]), tuple(terms))
-        )
+        # Rules of the file count the sets in its own order.
+        ascending = sorted(terms, key=lambda term: term.core)
+        name, universe = _quoted(section["Name"]), (low_high[0], low_high[1])
+        variable = Variable(name, unit, universe, tuple(ascending))
+        variables.append(_FileVariable(variable, [term.name for term in terms]))
     return variables
 
 
@@ -207,16 +206,16 @@ def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str,
     numbers = [int(part) for part in parts]
     if len(numbers) != len(variables):
         raise line.error(
-            f"{len(numbers)} terms for {[variable.name for variable in variables]}; 0 for any."
+            f"{len(numbers)} terms for {[one.variable.name for one in variables]}; 0 for any."
         )
     names = []
-    for number, variable in zip(numbers, variables, strict=True):
+    for number, (variable, terms) in zip(numbers, variables, strict=True):
         # MATLAB's sign for NOT.
         if number < 0:
             raise line.error("negated terms are not supported; write the opposite set.")
-        if number > len(variable.sets):
+        if number > len(terms):
             raise line.error(f"{variable.name!r} has no set {number}.")
-        names.append(variable.sets[number - 1].name if number else ANY)
+        names.append(terms[number - 1] if number else ANY)
     return tuple(names)
 
 

@@ -31,15 +31,16 @@ any number of inputs: `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
 
 from __future__ import annotations
 
-import json
 import math
+import reprlib
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.io.files import numbers, parse_json, write_atomically
+from nfriction.io.files import numbers, parse_json, shortened
+from nfriction.plant.base import check_keys
 
 FORMAT = "nfriction-rules/1"
 # Bounds of foreign files: inference costs rules times points of the output universe.
@@ -176,27 +177,8 @@ def parse_rules(text: str, source: str = "rules") -> RuleBase:
         raise ValueError(f"{source}: {shortened(error)}") from error
 
 
-def format_rules(rules: RuleBase) -> str:
-    """JSON text that `parse_rules` reads back to an equal rule base, its rules one by one."""
-    document = {
-        "format": FORMAT,
-        "name": rules.name,
-        "inputs": _described(rules.inputs),
-        "outputs": _described(rules.outputs),
-        "rules": [
-            {"if": rule.given, "then": rule.then, "weight": rule.weight} for rule in rules.rules
-        ],
-    }
-    return json.dumps(document, indent=1) + "\n"
-
-
-def save_rules(rules: RuleBase, path: str | Path) -> None:
-    """Write a rule base as a JSON file, atomically."""
-    write_atomically(path, format_rules(rules).encode())
-
-
 def _rule_base(document: Any) -> RuleBase:
-    _check_keys("the file", document, {"format", "inputs", "outputs"}, {"name", "table", "rules"})
+    check_keys("the file", document, ("format", "inputs", "outputs"), ("name", "table", "rules"))
     if document["format"] != FORMAT:
         raise ValueError(f'"format" must be {FORMAT!r}, got {document["format"]!r}.')
     # With both, they could contradict each other.
@@ -220,10 +202,10 @@ def _variables(entries: Any, kind: str) -> tuple[Variable, ...]:
 
 def _variable(name: str, entry: Any) -> Variable:
     where = f"variable {name!r}"
-    _check_keys(where, entry, {"unit", "sets"}, {"universe"})
+    check_keys(where, entry, ("unit", "sets"), ("universe",))
     sets, universe = entry["sets"], entry.get("universe")
     if not isinstance(sets, dict) or not sets:
-        raise ValueError(f'{where}: "sets" must map names to ranges, got {_brief(sets)}.')
+        raise ValueError(f'{where}: "sets" must map names to ranges, got {reprlib.repr(sets)}.')
     if all(isinstance(value, list) for value in sets.values()):
         ranges = [_pair(value, f"{where}: set {term!r}") for term, value in sets.items()]
         try:
@@ -244,7 +226,7 @@ def _variable(name: str, entry: Any) -> Variable:
 
 
 def _set(where: str, term: str, value: dict[str, Any]) -> FuzzySet:
-    _check_keys(where, value, {"shape", "parameters"}, set())
+    check_keys(where, value, ("shape", "parameters"))
     parameters = _expect(value["parameters"], list, where, '"parameters": a list of numbers')
     shape = _expect(value["shape"], str, f"{where}: shape", "text")
     return FuzzySet(term, shape, tuple(_number(number, where) for number in parameters))
@@ -260,16 +242,9 @@ def _table_rules(
         raise ValueError(f'"table": "columns" must name one of the inputs {names}.')
     across = names.index(table["columns"])
     columns, rows = inputs[across], inputs[1 - across]
-    # A misspelt row would otherwise be reported as a missing one only.
-    unknown = [row for row in table if row != "columns" and row not in rows.terms]
-    if unknown:
-        raise ValueError(
-            f'"table": unknown row {unknown[0]!r}; {rows.name!r} has the terms {rows.terms}.'
-        )
+    check_keys('"table"', table, ("columns", *rows.terms))
     rules = []
     for row in rows.terms:
-        if row not in table:
-            raise ValueError(f'"table": row {row!r} of {rows.name!r} is missing.')
         cells = _one_for_each(table[row], columns.terms, f'"table": row {row!r}', "cell")
         for column, cell in zip(columns.terms, cells, strict=True):
             where = f'"table": cell {row!r} x {column!r}'
@@ -277,7 +252,8 @@ def _table_rules(
             for term, output in zip(then, outputs, strict=True):
                 if term not in output.terms:
                     raise ValueError(
-                        f"{where}: unknown term {_brief(term)}; {output.name!r} has {output.terms}."
+                        f"{where}: unknown term {reprlib.repr(term)}; {output.name!r} has "
+                        f"{output.terms}."
                     )
             rules.append(Rule((column, row) if across == 0 else (row, column), tuple(then)))
     return tuple(rules)
@@ -287,7 +263,7 @@ def _listed_rules(entries: Any) -> tuple[Rule, ...]:
     rules = []
     for number, entry in enumerate(_expect(entries, list, '"rules"', "a list"), 1):
         where = f"rule {number}"
-        _check_keys(where, entry, {"if", "then"}, {"weight"})
+        check_keys(where, entry, ("if", "then"), ("weight",))
         given, then = (
             tuple(
                 _expect(term, str, f"{where}: {part}", "text")
@@ -311,63 +287,27 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _expect(value: Any, kind: type, where: str, form: str) -> Any:
     if not isinstance(value, kind):
-        raise ValueError(f"{where}: expected {form}, got {_brief(value)}.")
+        raise ValueError(f"{where}: expected {form}, got {reprlib.repr(value)}.")
     return value
 
 
 def _one_for_each(value: Any, names: list[str], where: str, part: str) -> list[Any]:
     if not isinstance(value, list) or len(value) != len(names):
-        raise ValueError(f"{where} needs a {part} for each of {names}, got {_brief(value)}.")
+        raise ValueError(f"{where} needs a {part} for each of {names}, got {reprlib.repr(value)}.")
     return value
-
-
-def _check_keys(where: str, entry: Any, needed: set[str], allowed: set[str]) -> None:
-    _expect(entry, dict, where, "an object in braces")
-    missing, unknown = needed - set(entry), set(entry) - needed - allowed
-    if missing:
-        raise ValueError(f"{where}: {sorted(missing)} missing.")
-    if unknown:
-        raise ValueError(
-            f"{where}: unknown {sorted(unknown)}; known are {sorted(needed | allowed)}."
-        )
 
 
 def _pair(value: Any, where: str) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
-        raise ValueError(f"{where}: expected [low, high], got {_brief(value)}.")
+        raise ValueError(f"{where}: expected [low, high], got {reprlib.repr(value)}.")
     return _number(value[0], where), _number(value[1], where)
 
 
 def _number(value: Any, where: str) -> float:
     # `numbers` would read those of a list, too.
     if isinstance(value, list):
-        raise ValueError(f"{where}: expected a number, got {_brief(value)}.")
+        raise ValueError(f"{where}: expected a number, got {reprlib.repr(value)}.")
     return float(numbers(where, value))
-
-
-def shortened(error: ValueError) -> str:
-    """An error's message, which may quote a name of any length."""
-    text = str(error)
-    return text if len(text) <= 500 else text[:497] + "..."
-
-
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _described(variables: tuple[Variable, ...]) -> dict[str, Any]:
-    return {
-        variable.name: {
-            "unit": variable.unit,
-            "universe": list(variable.universe),
-            "sets": {
-                term.name: {"shape": term.shape, "parameters": list(term.parameters)}
-                for term in variable.sets
-            },
-        }
-        for variable in variables
-    }
 
 
 def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, ...]) -> None:

@@ -2,7 +2,12 @@
 
 Gauss-Newton steps on the parameters w alternate with MacKay's updates of the precisions.
 
-The precisions alpha (by group) and beta have no halves, as in `posterior`.
+Convention (Foresee and Hagan): E_D = sum e^2 and E_g = sum (w - w0)^2 over group g, without
+halves. Minus the log posterior is beta E_D + sum_g alpha_g E_g, so the noise has the variance
+1 / (2 beta), a parameter of group g the prior variance 1 / (2 alpha_g), the posterior the
+covariance S^-1 / 2 with S = beta J^T J + diag(alpha), and at the maximum of the evidence
+
+    alpha_g = gamma_g / (2 E_g),    beta = (n - gamma) / (2 E_D).
 
 References:
     D. J. C. MacKay, Neural Computation 4 (1992) 415-472; F. D. Foresee and M. T. Hagan,
@@ -13,8 +18,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -23,15 +29,13 @@ from tqdm.auto import tqdm
 from nfriction.optim.group_evidence import factorise, group_sums
 from nfriction.papers.nffem.jacobian import (
     NormalEquations,
+    assign,
     check_samples,
     flatten,
-    jacobian_pieces,
     normal_equations,
     sum_of_squares,
     trainable,
-    unflatten,
 )
-from nfriction.papers.nffem.posterior import EvidenceProblem, Posterior, posterior, reestimate
 
 Status = Literal["converged", "noise_floor", "max_steps", "stalled", "not_finite", "stopped"]
 
@@ -43,8 +47,10 @@ MESSAGES: dict[str, str] = {
     "not_finite": "The errors or their Jacobian are not finite, at the start or at every step.",
     "stopped": "Stopped by the callback or by an interrupt; the parameters are the best reached.",
 }
-# Beyond it a step is too short to matter.
-LARGEST_DAMPING = 1e10
+# Of the first step, as in Foresee and Hagan; beyond the largest a step is too short to matter.
+FIRST_DAMPING, LARGEST_DAMPING = 0.005, 1e10
+# A group whose prior outweighs its data by this factor is switched off; alpha stops there.
+LARGEST_RATIO = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ class EvidenceState:
     w: Tensor
     alpha: Tensor
     beta: float = 1.0
-    damping: float = 0.005
+    damping: float = FIRST_DAMPING
     step: int = 0
 
 
@@ -78,26 +84,21 @@ class EvidenceOptions:
         tolerance: of convergence: relative error of alpha = gamma / 2E_g and beta =
             (n - gamma) / 2E_D, and gain of a full Gauss-Newton step in nats.
         noise_floor: standard deviation of the errors at which fitting ends.
-        initial_damping: mu of the first step.
         callback: called after each accepted step with the state; True stops.
         progress: show a bar.
     Raises:
-        ValueError: a tolerance or damping that is not positive.
+        ValueError: a tolerance that is not positive.
     """
 
     max_steps: int = 300
     tolerance: float = 1e-3
     noise_floor: float = 0.0
-    initial_damping: float = 0.005
     callback: Callback | None = None
     progress: bool = False
 
     def __post_init__(self) -> None:
-        if self.tolerance <= 0 or self.initial_damping <= 0:
-            raise ValueError(
-                "`tolerance` and `initial_damping` must be positive, got "
-                f"{self.tolerance} and {self.initial_damping}."
-            )
+        if self.tolerance <= 0:
+            raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class EvidenceResult:
         status: reason for the end; `message` gives it in words.
         w: parameters in one vector, shape (p,).
         alpha, gamma: prior precision and effective parameters, by group.
-        beta: noise precision; the noise has the standard deviation `noise_std`.
+        beta: noise precision; the noise has the variance 1 / (2 beta), in the targets' unit.
         error_squares: E_D.
         parameter_squares: E_g = sum (w - w0)^2, by group.
         samples: n, number of errors that E_D sums.
@@ -116,7 +117,6 @@ class EvidenceResult:
         covariance: posterior covariance of the parameters, shape (p, p).
         steps: accepted steps.
         history: log evidence before each step.
-        model, parameters: differentiated by `predictive_std`.
     """
 
     status: Status
@@ -131,8 +131,6 @@ class EvidenceResult:
     covariance: Tensor
     steps: int
     history: list[float]
-    model: nn.Module
-    parameters: dict[str, Tensor]
 
     @property
     def converged(self) -> bool:
@@ -143,28 +141,6 @@ class EvidenceResult:
     def message(self) -> str:
         """The status in words."""
         return MESSAGES[self.status]
-
-    @property
-    def noise_std(self) -> float:
-        """Standard deviation of the noise of an error, in the targets' unit."""
-        return math.sqrt(0.5 / self.beta)
-
-    def predictive_std(self, x: Tensor, noise: bool = True) -> Tensor:
-        """Standard deviation of the outputs at `x` by the uncertainty of parameters and noise.
-
-        Args:
-            x: inputs, shape (m, ...).
-            noise: include that of a new measurement, or only that of the function.
-        Returns:
-            Shape of the outputs, (m, *outputs).
-        """
-        floor = 0.5 / self.beta if noise else 0.0
-        deviations = []
-        for _, output, jacobians in jacobian_pieces(self.model, self.parameters, x):
-            # Only the diagonal of J C J^T.
-            variance = torch.stack([((J @ self.covariance) * J).sum(-1) for J in jacobians], -1)
-            deviations.append((variance.clamp(min=0) + floor).sqrt().view_as(output))
-        return torch.cat(deviations)
 
 
 def bayesian_regularisation(
@@ -187,15 +163,14 @@ def bayesian_regularisation(
     interrupt or the callback ends it; a fit that fails from the start leaves the module unchanged.
 
     Args:
-        model: outputs of sample i depend on sample i only; see `nfriction.papers.nffem.jacobian`
-            for modules that offer their derivatives.
+        model: outputs of sample i depend on sample i only.
         x: inputs, shape (n, ...).
         y: targets, shape of the model's output.
         kind: group of a parameter by its name; by default each is a group of its own.
         prior: values w0 by parameter name, 0 where missing.
         options: settings; the noise floor is in the unit of `y`.
     Returns:
-        Weights, alpha, beta, gamma, log evidence, error bars and status.
+        Weights, alpha, beta, gamma, log evidence, covariance and status.
     Raises:
         ValueError: samples or prior do not fit the model.
     """
@@ -216,44 +191,50 @@ def bayesian_regularisation(
     rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
     # Samples last in memory, as layers take them: kernels are vectorised over samples.
     x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
-    problem = EvidenceProblem(
-        equations=lambda w: normal_equations(model, unflatten(w, parameters), x, y),
-        squares=lambda w: sum_of_squares(model, unflatten(w, parameters), x, y),
-        samples=y.numel(), prior=flatten(centres), groups=places.repeat_interleave(sizes),
-        names=names,
-    )  # fmt: skip
     options = replace(options, noise_floor=max(options.noise_floor, rounding))
-    fit = _Fit(problem, options, flatten(parameters))
+    prior_groups = PriorGroups(flatten(centres), places.repeat_interleave(sizes), names)
+    fit = _Fit(deepcopy(model), (x, y), prior_groups, options)
     try:
         status = fit.run()
     except KeyboardInterrupt:
         status = "stopped"
-    best = unflatten(fit.state.w.clone(), parameters)
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if name in best:
-                parameter.copy_(best[name])
-    return fit.result(status, model, best)
+    assign(model, fit.state.w)
+    return fit.result(status)
+
+
+class PriorGroups(NamedTuple):
+    """Prior w0 (p,), group of each parameter (p,), and the names of the groups."""
+
+    centre: Tensor
+    of: Tensor
+    names: list[str]
 
 
 class _Fit:
-    """A run of `bayesian_regularisation`."""
+    """A run of `bayesian_regularisation`, which overwrites the parameters of `model`."""
 
-    def __init__(self, problem: EvidenceProblem, options: EvidenceOptions, w: Tensor) -> None:
-        self.problem, self.options = problem, options
+    def __init__(
+        self,
+        model: nn.Module,
+        data: tuple[Tensor, Tensor],
+        prior: PriorGroups,
+        options: EvidenceOptions,
+    ) -> None:
+        self.model, self.data, self.prior, self.options = model, data, prior, options
+        self.samples = data[1].numel()
+        w = flatten(trainable(model))
         # Exact fits would otherwise drive beta to infinity.
         self.noise_floor = max(options.noise_floor, 1e-15)
         # An interrupt of the first evaluation must still find something to report.
         nan = torch.full_like(w, math.nan)
-        unknown = nan.new_full((len(problem.names),), math.nan)
-        self.state = EvidenceState(w, unknown, damping=options.initial_damping)
+        self.state = EvidenceState(w, nan.new_full((len(prior.names),), math.nan))
         self.local = NormalEquations(nan.diag(), nan, nan.sum())
         self.history: list[float] = []
         self.not_finite = False
 
     def run(self) -> Status:
         options, callback = self.options, self.options.callback
-        self.local = self.problem.equations(self.state.w)
+        self.local = normal_equations(self.model, *self.data)
         if not self.local.finite:
             return "not_finite"
         self._start()
@@ -266,7 +247,7 @@ class _Fit:
                 self.history.append(known.log_evidence)
                 if self._settled(known):
                     return "converged"
-                unexplained = self.problem.samples - float(known.gamma.sum())
+                unexplained = self.samples - float(known.gamma.sum())
                 # Below the known noise the fit only learns that noise.
                 if float(self.local.squares) <= unexplained * self.noise_floor**2:
                     return "noise_floor"
@@ -274,7 +255,11 @@ class _Fit:
                     return "max_steps"
                 # At the start the residuals say nothing yet about noise and priors.
                 if self.state.step > 0:
-                    self._reestimate(known)
+                    alpha, beta = reestimate(
+                        known, self.local, self.prior.of, self.samples, self.state.alpha,
+                        0.5 / self.noise_floor**2,
+                    )  # fmt: skip
+                    self.state = replace(self.state, alpha=alpha, beta=beta)
                 failed = self._advance()
                 if failed is not None:
                     return failed
@@ -284,16 +269,16 @@ class _Fit:
                     return "stopped"
 
     def posterior(self) -> Posterior:
-        return posterior(self.problem, self.local, self.state.w, self.state.alpha, self.state.beta)
+        state, offset = self.state, self.state.w - self.prior.centre
+        return posterior(self.local, offset, self.prior.of, self.samples, state.alpha, state.beta)
 
     def _start(self) -> None:
         """Noise as large as the errors and a prior far below the data."""
-        problem, local = self.problem, self.local
-        beta = problem.samples / max(2 * float(local.squares), 1e-300)
+        local, groups, count = self.local, self.prior.of, len(self.prior.names)
+        beta = self.samples / max(2 * float(local.squares), 1e-300)
         beta = min(beta, 0.5 / self.noise_floor**2)
-        count = len(problem.names)
-        sizes = group_sums(torch.ones_like(local.Jte), problem.groups, count)
-        curvature = group_sums(local.JtJ.diagonal(), problem.groups, count) / sizes
+        sizes = group_sums(torch.ones_like(local.Jte), groups, count)
+        curvature = group_sums(local.JtJ.diagonal(), groups, count) / sizes
         # A group without influence at the start has no curvature to compare with.
         curvature = torch.where(curvature > 0, curvature, local.JtJ.diagonal().mean())
         # Far below the data: the first step is nearly plain least squares.
@@ -305,7 +290,7 @@ class _Fit:
         alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
         # Derivatives of the log evidence by log alpha are (gamma - 2 alpha E_g) / 2.
         off = (gamma - 2 * alpha * known.parameter_squares).abs() / gamma.clamp(min=1)
-        unexplained = self.problem.samples - float(gamma.sum())
+        unexplained = self.samples - float(gamma.sum())
         noise_off = abs(unexplained - 2 * self.state.beta * float(self.local.squares))
         return (
             known.newton_decrement <= tolerance
@@ -313,16 +298,11 @@ class _Fit:
             and noise_off <= tolerance * max(unexplained, 1.0)
         )
 
-    def _reestimate(self, known: Posterior) -> None:
-        largest = 0.5 / self.noise_floor**2
-        alpha, beta = reestimate(self.problem, known, self.local, self.state.alpha, largest)
-        self.state = replace(self.state, alpha=alpha, beta=beta)
-
     def _advance(self) -> Status | None:
         """Take one step that lowers the objective, with as much damping as that needs."""
-        state, problem, local = self.state, self.problem, self.local
-        precision = state.alpha[problem.groups]
-        offset = state.w - problem.prior
+        state, local = self.state, self.local
+        precision = state.alpha[self.prior.of]
+        offset = state.w - self.prior.centre
         system = state.beta * local.JtJ + precision.diag()
         slope = state.beta * local.Jte + precision * offset
         objective = float(state.beta * local.squares + precision @ offset.square())
@@ -355,31 +335,29 @@ class _Fit:
         self, w: Tensor, precision: Tensor, objective: float
     ) -> tuple[NormalEquations, float] | None:
         """Normal equations at `w` and the objective's fall, if all is finite and there is one."""
-        beta, problem = self.state.beta, self.problem
-        shrinkage = float(precision @ (w - problem.prior).square())
-        if problem.squares is not None:
-            cheap = float(beta * problem.squares(w)) + shrinkage
-            self.not_finite = not math.isfinite(cheap)
-            # Most rejected trials end here, at a fraction of the cost of a Jacobian.
-            if not cheap < objective:
-                return None
-        there = problem.equations(w)
+        beta = self.state.beta
+        shrinkage = float(precision @ (w - self.prior.centre).square())
+        assign(self.model, w)
+        cheap = float(beta * sum_of_squares(self.model, *self.data)) + shrinkage
+        self.not_finite = not math.isfinite(cheap)
+        # Most rejected trials end here, at a fraction of the cost of a Jacobian.
+        if not cheap < objective:
+            return None
+        there = normal_equations(self.model, *self.data)
         self.not_finite = not there.finite
         # The sum that the next objective starts from decides, not its cheap twin.
         fall = objective - float(beta * there.squares) - shrinkage
         return (there, fall) if fall > 0 and not self.not_finite else None
 
-    def result(
-        self, status: Status, model: nn.Module, parameters: dict[str, Tensor]
-    ) -> EvidenceResult:
-        state, names = self.state, self.problem.names
+    def result(self, status: Status) -> EvidenceResult:
+        state = self.state
         unknown = torch.full_like(state.alpha, math.nan)
         known = Posterior(self.local.JtJ * math.nan, unknown, math.nan, math.nan, unknown)
         if self.local.finite:
             known = self.posterior()
 
         def named(values: Tensor) -> dict[str, float]:
-            return dict(zip(names, values.tolist(), strict=True))
+            return dict(zip(self.prior.names, values.tolist(), strict=True))
 
         return EvidenceResult(
             status=status,
@@ -389,11 +367,104 @@ class _Fit:
             gamma=named(known.gamma),
             error_squares=float(self.local.squares),
             parameter_squares=named(known.parameter_squares),
-            samples=self.problem.samples,
+            samples=self.samples,
             log_evidence=known.log_evidence,
             covariance=known.covariance,
             steps=state.step,
             history=self.history,
-            model=model,
-            parameters=parameters,
         )
+
+
+class Posterior(NamedTuple):
+    """Gauss-Laplace posterior at given parameters, alpha and beta.
+
+    Args:
+        covariance: of the parameters, (2 S)^-1, shape (p, p).
+        gamma: effective (well determined) parameters of each group, shape (groups,).
+        log_evidence: log p(data | alpha, beta) in nats, with all its constants.
+        newton_decrement: gain of a full Gauss-Newton step in log posterior, in nats.
+        parameter_squares: E_g, shape (groups,).
+    """
+
+    covariance: Tensor
+    gamma: Tensor
+    log_evidence: float
+    newton_decrement: float
+    parameter_squares: Tensor
+
+
+def posterior(
+    local: NormalEquations,
+    offset: Tensor,
+    groups: Tensor,
+    samples: int,
+    alpha: Tensor,
+    beta: float,
+) -> Posterior:
+    """Posterior, effective parameters and log evidence; exact where the model is linear.
+
+    Args:
+        local: J^T J, J^T e and E_D at the parameters w.
+        offset: w - w0, shape (p,).
+        groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
+        samples: number n of errors that E_D sums.
+        alpha: prior precision (halved) of each group, shape (groups,), positive.
+        beta: noise precision (halved), positive.
+    """
+    count, precision = len(alpha), alpha[groups]
+    # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
+    scale, factor = factorise(beta * local.JtJ + precision.diag())
+    inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
+    slope = beta * local.Jte + precision * offset
+    squares = group_sums(offset.square(), groups, count)
+    # The diagonal of S^-1 (beta J^T J) equals 1 - alpha (S^-1)_ii, but keeps its digits where the
+    # prior dominates and the difference would be rounding.
+    determined = beta * (inverse * local.JtJ).sum(1)
+    sizes = group_sums(torch.ones_like(offset), groups, count)
+    log_determinant = 2 * factor.diagonal().log().sum() - 2 * scale.log().sum()
+    log_evidence = (
+        -beta * local.squares
+        - alpha @ squares
+        + 0.5 * samples * math.log(beta / math.pi)
+        + 0.5 * sizes @ alpha.log()
+        - 0.5 * log_determinant
+    )
+    return Posterior(
+        covariance=inverse / 2,
+        gamma=group_sums(determined, groups, count).clamp(min=0),
+        log_evidence=float(log_evidence),
+        newton_decrement=float(slope @ (inverse @ slope)),
+        parameter_squares=squares,
+    )
+
+
+def reestimate(
+    known: Posterior,
+    local: NormalEquations,
+    groups: Tensor,
+    samples: int,
+    alpha: Tensor,
+    largest_beta: float = math.inf,
+) -> tuple[Tensor, float]:
+    """MacKay's fixed-point update: alpha_g = gamma_g / (2 E_g), beta = (n - gamma) / (2 E_D).
+
+    A group that has not left its prior's centre keeps its alpha: it has no information yet.
+
+    Args:
+        known: `posterior` at the present alpha and beta.
+        local, groups, samples, alpha: those of this posterior.
+        largest_beta: limit by a known noise floor.
+    Returns:
+        The new alpha, shape (groups,), and beta.
+    """
+    curvature = group_sums(local.JtJ.diagonal(), groups, len(alpha))
+    # As many parameters as samples would leave no noise at all.
+    beta = float((samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
+    beta = min(beta, largest_beta)
+    limit = LARGEST_RATIO * beta * curvature
+    # A group without curvature has no scale for a limit.
+    limit = torch.where(limit > 0, limit, alpha)
+    estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
+    # At the centre of its prior the estimate divides zero by zero.
+    usable = (known.parameter_squares > 0) & (estimate > 0)
+    return torch.where(usable, estimate, alpha), beta

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
+from typing import Any
 
-import jinja2
 import torch
 from torch import Tensor
 
@@ -28,6 +27,8 @@ from nfriction.friction.parameters import positive_number
 from nfriction.io.files import write_atomically
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.version import __version__
+
+TEMPLATES = ("nfriction.papers.nffem",)
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def write_online(
     """
     if not is_identifier(name):
         raise ValueError(f"`name` must be an identifier of C of up to 31 letters, got {name!r}.")
-    learner, dialect = OnlineNetwork(model, options), ControllerC(prefix=name)
+    learner, dialect = OnlineNetwork(model, options), ControllerC(prefix=name, templates=TEMPLATES)
     schedule = learner.schedule
     network = schedule.network
     values = {
@@ -186,19 +187,19 @@ def write_online(
         "scale": learner.scale, "least": learner.least, "most": learner.most,
     }  # fmt: skip
     law, torque = _law(learner, dialect)
-    words = {
+    words: dict[str, Any] = {
         "name": name, "model": type(model).__name__, "version": __version__,
         "joints": model.joints, "coefficients": len(model.law.names), "units": network.units,
         "along_motion": schedule.along_motion, "turn": schedule.turn, "law": law, "torque": torque,
         "variance": options.spread**2, "noise_variance": options.noise**2,
         "forget": options.forget, "slowest": options.slowest, "forgetting": options.forgetting,
-        "sample_time": options.sample_time, "number": dialect.literal,
+        "sample_time": options.sample_time,
         "table": lambda key, *sizes: dialect.table(key, values[key].detach(), *sizes),
     }  # fmt: skip
-    body = _filled("online.c.j2", dialect, words | {"helpers": ""})
+    body = dialect.text("online.c.j2", **words, helpers="")
     texts = {
-        f"{name}.c": _filled("online.c.j2", dialect, words | {"helpers": dialect.functions(body)}),
-        f"{name}.h": _filled("online.h.j2", dialect, words),
+        f"{name}.c": dialect.text("online.c.j2", **words, helpers=dialect.functions(body)),
+        f"{name}.h": dialect.text("online.h.j2", **words),
     }
     return [write_atomically(Path(folder) / key, text.encode()) for key, text in texts.items()]
 
@@ -221,13 +222,3 @@ def _law(learner: OnlineNetwork, dialect: ControllerC) -> tuple[list[str], str]:
     torque, slopes = (port.nodes for port in program.outputs)
     lines, texts = statements([*torque, *slopes], bound, dialect)
     return [*lines, *(f"slope[{k}] = {text};" for k, text in enumerate(texts[1:]))], texts[0]
-
-
-def _filled(template: str, dialect: ControllerC, words: dict[str, object]) -> str:
-    """A template of this folder with its words filled in."""
-    text = resources.files("nfriction.papers.nffem").joinpath(template).read_text("ascii")
-    environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )  # fmt: skip
-    return dialect.own(environment.from_string(dialect.own(text)).render(words))

@@ -19,7 +19,7 @@ from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy.partition import FreePartition
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
-from nfriction.papers.nffem.jacobian import CHUNK_ENTRIES, flatten, trainable, unflatten
+from nfriction.papers.nffem.jacobian import CHUNK_ENTRIES, assign, flatten, trainable
 
 FuzzyNetwork = Anfis | AnfisRBF | RBFNetwork
 
@@ -181,10 +181,9 @@ class Projection:
         if layer.groups != 1:
             raise ValueError(f"`layer` must be of one group, got {layer.groups}.")
         self.layer, self.x, self.y, self.ridge = layer, x, y, ridge
-        self.parameters = {n: p for n, p in layer.named_parameters() if p.requires_grad}
-        sizes = torch.tensor([p.numel() for p in self.parameters.values()])
-        linear = torch.tensor([n in LINEAR for n in self.parameters]).repeat_interleave(sizes)
-        self.linear, self.moving = linear.to(x.device), ~linear.to(x.device)
+        parts = [torch.full_like(p, n in LINEAR).flatten() for n, p in trainable(layer).items()]
+        self.linear = torch.cat(parts).bool()
+        self.moving = ~self.linear
         self.shared = layer.readout().shape[2]
         self.total = layer.jacobian_columns(x[:1]).shape[1]
         # Of a fixed size, so that memory does not grow with the samples.
@@ -192,7 +191,6 @@ class Projection:
         # Written again and again: the first touch of fresh memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
         self.target_squares = y.square().sum()
-        self._eliminated: _Eliminated | None = None
 
     @property
     def theta(self) -> Tensor:
@@ -208,12 +206,16 @@ class Projection:
         )
         return whole and bool(self.moving.any())
 
-    @torch.no_grad()
     def cost(self, theta: Tensor) -> Tensor:
         """Half the squares, with the ridge's, of the best output layer, which the layer takes."""
+        return self._eliminate(theta)[0]
+
+    @torch.no_grad()
+    def _eliminate(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost, best output layer (regressors, outputs), and the factor of the regressors' Gram."""
         w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
-        self._assign(w)
+        assign(self.layer, w)
         G = self.x.new_zeros(self.shared, self.shared)
         b = self.x.new_zeros(self.shared, self.y.shape[-1])
         for rows in self._chunks():
@@ -227,10 +229,8 @@ class Projection:
         # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
         placed = _pulled_back(self._maps()[:, : self.shared], weights)
         w[self.linear] = placed[self.linear]
-        self._assign(w)
-        cost = 0.5 * (self.target_squares - (b * weights).sum())
-        self._eliminated = _Eliminated(theta.clone(), weights, factor, cost)
-        return cost
+        assign(self.layer, w)
+        return 0.5 * (self.target_squares - (b * weights).sum()), weights, factor
 
     @torch.no_grad()
     def quadratic(self, theta: Tensor) -> Quadratic:
@@ -239,12 +239,7 @@ class Projection:
         References:
             Golub and Pereyra (1973); L. Kaufman, BIT 15 (1975) 49-57.
         """
-        known = self._eliminated
-        # The solver has just evaluated the cost there, except at its start.
-        if known is None or not torch.equal(known.theta, theta):
-            self.cost(theta)
-            known = self._eliminated
-        assert known is not None
+        cost, weights, factor = self._eliminate(theta)
         shared = self.shared
         A = self.x.new_zeros(self.total - shared, self.total)
         b = self.x.new_zeros(self.total - shared, self.y.shape[-1])
@@ -252,16 +247,12 @@ class Projection:
             out = self.buffer[:, :, : rows.stop - rows.start]
             F = self.layer.jacobian_columns(self.x[rows], out)[0]
             A.addmm_(F[shared:], F.T)
-            b.addmm_(F[shared:], F[:shared].T @ known.weights - self.y[rows, 0])
+            b.addmm_(F[shared:], F[:shared].T @ weights - self.y[rows, 0])
         # Schur complement: curvature that the re-optimised output layer removes.
-        explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, known.factor)
+        explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, factor)
         maps = self._maps()[:, shared:, self.moving]
         hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)
-        return Quadratic(known.cost, _pulled_back(maps, b), hessian)
-
-    def _assign(self, w: Tensor) -> None:
-        for name, value in unflatten(w, self.parameters).items():
-            self.parameters[name].copy_(value)
+        return Quadratic(cost, _pulled_back(maps, b), hessian)
 
     def _maps(self) -> Tensor:
         """Shape (outputs, columns, parameters)."""
@@ -271,16 +262,6 @@ class Projection:
         n = len(self.x)
         for start in range(0, n, self.buffer.shape[-1]):
             yield slice(start, min(start + self.buffer.shape[-1], n))
-
-
-@dataclass(frozen=True, eq=False)
-class _Eliminated:
-    """The best output layer at `theta`: weights (regressors, outputs), factor of their Gram."""
-
-    theta: Tensor
-    weights: Tensor
-    factor: Tensor
-    cost: Tensor
 
 
 def _pulled_back(maps: Tensor, columns: Tensor) -> Tensor:

@@ -95,32 +95,6 @@ def recorded_losses(
     return losses, keep
 
 
-@dataclass(frozen=True, eq=False)
-class NetworkFit:
-    """Outcome of the training of one group.
-
-    Args:
-        evidence: result in scaled units (inputs and outputs on [-1, 1]); log evidences of fits to
-            the same samples can be compared.
-        scaling: between these and the samples' own units.
-    """
-
-    evidence: EvidenceResult
-    scaling: Scaling
-
-    def predictive_std(self, x: Tensor, noise: bool = True) -> Tensor:
-        """Standard deviation of the outputs by parameters and noise, in the samples' units.
-
-        Args:
-            x: inputs of this group, shape (samples, inputs).
-            noise: include that of a new sample, or only that of the function.
-        Returns:
-            Shape (samples, outputs).
-        """
-        scaled = self.scaling.inputs(x.unsqueeze(1))
-        return self.evidence.predictive_std(scaled, noise)[:, 0] * self.scaling.y_half[0]
-
-
 def controller_targets(
     controller: MamdaniController, samples: int = 40_000, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
@@ -148,7 +122,7 @@ def train_on_controller(
     *,
     samples: int = 40_000,
     options: TrainingOptions = DEFAULTS,
-) -> list[NetworkFit]:
+) -> list[EvidenceResult]:
     """Train a network, in place, on the outputs of fuzzy controllers: the papers' last step.
 
     An ANFIS starts from a controller's own sets where it has as many, else from an even grid over
@@ -161,7 +135,8 @@ def train_on_controller(
         options: see `train_network`.
 
     Returns:
-        A fit for each group; fewer if an interrupt or the callback ended the training.
+        The result of each group in scaled units, inputs and outputs on [-1, 1]; fewer if an
+        interrupt or the callback ended the training.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (40,000 samples a joint, 2-10-2 network).
@@ -186,7 +161,7 @@ def train_on_controller(
 
 def train_network(
     network: FuzzyNetwork, x: Tensor, y: Tensor, options: TrainingOptions = DEFAULTS
-) -> list[NetworkFit]:
+) -> list[EvidenceResult]:
     """Train a network in place on samples by Bayesian regularisation, each group for itself.
 
     Every kind of parameter has its own prior: centres, widths and their like around where the best
@@ -199,8 +174,9 @@ def train_network(
         options: starts, steps and the callback.
 
     Returns:
-        A fit for each group; fewer if an interrupt or the callback ended the training. The groups
-        after it then have the least-squares output layer for their first sets.
+        The result of each group in scaled units, inputs and outputs on [-1, 1]; fewer if an
+        interrupt or the callback ended the training. The groups after it then have the
+        least-squares output layer for their first sets.
 
     Raises:
         ValueError: if samples do not fit the network, are not finite, or an input never varies.
@@ -212,14 +188,14 @@ def train_network(
     # All groups get a usable network before the long part, which an interrupt may end.
     for group in groups:
         group.solve_linear(options.search_samples)
-    fits: list[NetworkFit] = []
+    fits: list[EvidenceResult] = []
     for group in groups:
         try:
             result = group.regularise(group.search(options), options)
         except KeyboardInterrupt:
             break
         group.write_back()
-        fits.append(NetworkFit(result, group.scaling))
+        fits.append(result)
         if result.status == "stopped":
             break
     return fits

@@ -15,13 +15,9 @@ from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 from nfriction.papers.controller.samples import ControllerSamples, sampled
+from nfriction.papers.nffem.evidence import EvidenceResult
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
-from nfriction.papers.nffem.train_network import (
-    DEFAULTS,
-    NetworkFit,
-    TrainingOptions,
-    train_network,
-)
+from nfriction.papers.nffem.train_network import DEFAULTS, TrainingOptions, train_network
 from nfriction.signals import Motion
 
 Ranges = list[tuple[float, float]]
@@ -37,7 +33,7 @@ def papers_neuro_fuzzy(
     samples: int = 40_000,
     units: int = 10,
     options: TrainingOptions = DEFAULTS,
-) -> tuple[NeuroFuzzyModel, list[NetworkFit]]:
+) -> tuple[NeuroFuzzyModel, list[EvidenceResult]]:
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
     The coefficients by class span the outputs of a fuzzy controller with the papers' rules, the
@@ -94,7 +90,7 @@ def train_on_samples(
     units: int = 10,
     options: TrainingOptions = DEFAULTS,
     v_smooth: float = V_SMOOTH,
-) -> tuple[NeuroFuzzyModel, list[NetworkFit]]:
+) -> tuple[NeuroFuzzyModel, list[EvidenceResult]]:
     """A model whose coefficients are radial basis networks trained on controllers' samples.
 
     Args:

@@ -291,7 +291,7 @@ def network_by_controller(
         options=TrainingOptions(seed=settings.seed, progress=progress, callback=keep),
     )  # fmt: skip
     workspace.finish(f"NF{law}-losses", losses)
-    unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]
+    unfinished = [fit.message for fit in fits if not fit.converged]
     status = f"Not converged: {len(unfinished)} of {len(fits)} networks. {' '.join(unfinished[:1])}"
     return model, {
         "procedure": "classes, fuzzy controller, network by Bayesian regularisation",

@@ -218,14 +218,14 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
     return _beside(_table(found), _table(SECOND_COEFFICIENTS[law]))
 
 
-def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
+def second_table_4(workspace: Workspace) -> pd.DataFrame:
     """Position RMSE on the second paper's rig, beside the paper's.
 
     References:
         RTIP paper, Table IV.
     """
     # Stages of this rig have a prefix that the table does not need.
-    ours = rmse(workspace, SECOND_PAPER, split=split).set_axis(list(LAWS))
+    ours = rmse(workspace, SECOND_PAPER).set_axis(list(LAWS))
     return _beside(ours, _table(SECOND_TABLE_4))
 
 

@@ -308,8 +308,22 @@ def build(
 def write(twin: Twin, folder: Path) -> None:
     """Write a twin's recordings, their overview, its rig and its truth; see `build`."""
     folder.mkdir(parents=True, exist_ok=True)
+    rows = []
     for label, recording in twin.recordings.items():
-        recording.write(folder / _file(label))
+        name, (q0, qd0) = f"{label}.csv.gz", twin.initial_states[label]
+        recording.write(folder / name)
+        rows.append(
+            {
+                "id": label,
+                "file": name,
+                "split": twin.splits[label],
+                "n": len(recording),
+                "duration_s": recording.duration,
+                **{f"q0_{k + 1}": value for k, value in enumerate(q0)},
+                **{f"qd0_{k + 1}": value for k, value in enumerate(qd0)},
+                "digest": recording.digest(),
+            }
+        )
     rigs.write(twin.plant, folder / "rig.json")
     arrays = {
         f"{label}_{key}": getattr(motion, key)
@@ -319,7 +333,7 @@ def write(twin: Twin, folder: Path) -> None:
     # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
     with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
-    write_table(_overview(twin), folder / "recordings.csv")
+    write_table(pd.DataFrame(rows), folder / "recordings.csv")
 
 
 def read(name: str, folder: Path) -> Twin:
@@ -365,26 +379,3 @@ def _read(
         convention=convention,
         name=label,
     )
-
-
-def _overview(twin: Twin) -> pd.DataFrame:
-    rows = []
-    for label, recording in twin.recordings.items():
-        q0, qd0 = twin.initial_states[label]
-        rows.append(
-            {
-                "id": label,
-                "file": _file(label),
-                "split": twin.splits[label],
-                "n": len(recording),
-                "duration_s": recording.duration,
-                **{f"q0_{k + 1}": value for k, value in enumerate(q0)},
-                **{f"qd0_{k + 1}": value for k, value in enumerate(qd0)},
-                "digest": recording.digest(),
-            }
-        )
-    return pd.DataFrame(rows)
-
-
-def _file(label: str) -> str:
-    return f"{label}.csv.gz"

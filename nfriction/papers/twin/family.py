@@ -237,7 +237,9 @@ class _Motion:
             return torque, v - np.abs(v) * torque / np.maximum(level, of["dry"] / 4)
 
         def accelerations(drag: Array) -> Array:
-            torque = _absolute(drag + fluid)
+            # A joint's torque acts on two links.
+            torque = drag + fluid
+            torque[:-1] -= torque[1:]
             return np.linalg.solve(between.real.T, (force - torque).T[..., None])[..., 0].T
 
         drag, bending = drag_of(dry)
@@ -303,11 +305,6 @@ class _Motion:
 def _joint(absolute: Array) -> Array:
     """Joint angles or rates of absolute ones."""
     return np.concatenate([absolute[:1], absolute[1:] - absolute[:-1]])
-
-
-def _absolute(torque: Array) -> Array:
-    """Generalised forces on absolute angles of joint torques, which act on two links each."""
-    return np.concatenate([torque[:-1] - torque[1:], torque[-1:]])
 
 
 def _card(twin: Twin, command: str, friction: Mapping[str, Array]) -> str:

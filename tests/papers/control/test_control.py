@@ -13,13 +13,20 @@ import torch
 from nfriction import LFM, NFLFM, export, rigs
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.control import study
-from nfriction.papers.control.feedback import Compensation, balance_gains, gains_along, linearise
+from nfriction.papers.control.feedback import (
+    Compensation,
+    Feedback,
+    balance_gains,
+    gains_along,
+    linearise,
+)
 from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.simulation.rollout import rollout
 
 PLANT = rigs.rtip("free")
 UPRIGHT = torch.zeros(4, dtype=torch.float64)
 LINEAR = linearise(PLANT, UPRIGHT, UPRIGHT, UPRIGHT, 1e-3)
+TOP = study.top_gains(PLANT)
 
 
 def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
@@ -33,13 +40,10 @@ def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
 
 
 def test_the_upright_rig_is_unstable_and_its_loops_are_not() -> None:
-    gains = study.top_gains(PLANT)
     joints = np.hstack([np.eye(4), np.zeros((4, 4))])
     assert np.abs(np.linalg.eigvals(LINEAR.a)).max() > 1.003
-    assert (
-        np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], gains.feedback))).max() < 1.0
-    )
-    kept = np.eye(8) - gains.observer @ joints
+    assert np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], TOP.feedback))).max() < 1.0
+    kept = np.eye(8) - TOP.observer @ joints
     assert np.abs(np.linalg.eigvals(kept @ LINEAR.a)).max() < 1.0
 
 
@@ -59,7 +63,7 @@ def test_true_friction_is_passive() -> None:
 @pytest.mark.slow
 def test_three_links_stay_upright() -> None:
     runs = study.controlled(
-        PLANT, study.true_friction(PLANT), {study.NONE: study.feedback(PLANT)}, seconds=2.0
+        PLANT, study.true_friction(PLANT), {study.NONE: Feedback(PLANT, TOP)}, seconds=2.0
     )
     found = study.performance(runs[study.NONE], follow=False, settled=1.0)
     assert found["largest tilt [mrad]"] < 200
@@ -69,10 +73,9 @@ def test_three_links_stay_upright() -> None:
 def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
     plant = study.single_link()
     friction = study.true_friction(plant)
-    controllers = {
-        study.NONE: study.feedback(plant),
-        study.TRUTH: study.feedback(plant, study.compensation_of(friction)),
-    }
+    given = {study.NONE: None, study.TRUTH: study.compensation_of(friction)}
+    top = study.top_gains(plant)
+    controllers = {n: Feedback(plant, top, compensation=one) for n, one in given.items()}
     runs = study.controlled(plant, friction, controllers, seconds=12.0)
     found = {n: study.performance(run, follow=False, settled=4.0) for n, run in runs.items()}
     key = "limit cycle [mrad]"
@@ -81,7 +84,7 @@ def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
 
 def test_a_fallen_rig_has_no_tracking_error() -> None:
     friction = study.true_friction(PLANT)
-    controllers = {study.NONE: study.feedback(PLANT)}
+    controllers = {study.NONE: Feedback(PLANT, TOP)}
     runs = study.controlled(PLANT, friction, controllers, seconds=0.5)
     run = runs[study.NONE]
     run.q[-1, 1] = 2.0
@@ -92,9 +95,8 @@ def test_gains_along_a_motion_that_stays_at_the_top_become_those_of_the_top() ->
     still = torch.zeros(3000, 4, dtype=torch.float64)
     way = linearise(PLANT, still, still, still, 1e-3)
     found = gains_along(way, still[:, 0].numpy(), LINEAR, study.weights(4))
-    top = study.top_gains(PLANT)
-    np.testing.assert_allclose(found[0].feedback, top.feedback, rtol=1e-6)
-    np.testing.assert_allclose(found[-1].observer, top.observer, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(found[0].feedback, TOP.feedback, rtol=1e-6)
+    np.testing.assert_allclose(found[-1].observer, TOP.observer, rtol=1e-3, atol=1e-6)
 
 
 def test_a_swing_up_without_time_is_refused() -> None:
@@ -108,7 +110,7 @@ def test_three_links_swing_up_and_stay() -> None:
     friction = study.true_friction(PLANT)
     guess = LFM(4, [0.01, 0.002]).requires_grad_(False)
     way = study.way_up(PLANT, guess)
-    controller = study.feedback(PLANT, study.compensation_of(friction), way=way)
+    controller = Feedback(PLANT, TOP, way, compensation=study.compensation_of(friction))
     (run,) = study.controlled(PLANT, friction, {"": controller}, seconds=2.0).values()
     assert float(run.q[0, 1]) == math.pi
     upright = run.q[run.time > 6.0, 1:].cumsum(-1).abs()
@@ -146,7 +148,10 @@ def test_exported_c_in_the_loop_gives_the_same_motion(kind: type, tmp_path: Path
     model = kind(4, [0.05, 0.17]).requires_grad_(False)
     friction = study.true_friction(PLANT)
     given = {"torch": study.compensation_of(model), "C": compiled(model, tmp_path), "none": None}
-    controllers = {n: study.feedback(PLANT, one, follow=True) for n, one in given.items()}
+    controllers = {
+        n: Feedback(PLANT, TOP, reference=study.reference, compensation=one)
+        for n, one in given.items()
+    }
     runs = study.controlled(PLANT, friction, controllers, seconds=0.4)
     # Torques pass a converter of 16 bits, which removes what the last bits of exp differ by.
     assert torch.equal(runs["torch"].tau, runs["C"].tau)

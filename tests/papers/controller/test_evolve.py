@@ -68,14 +68,14 @@ def test_a_resumed_evolution_is_the_whole_one(tmp_path: Path) -> None:
         callback=lambda *about: seen.append(about),
     )  # fmt: skip
     assert [g for _, g in seen] == [2, 3, 2, 3]
-    assert [c.genes for c in again] == [c.genes for c in whole]
+    assert [c.controller.rule_base for c in again] == [c.controller.rule_base for c in whole]
     with pytest.raises(ValueError, match="other options"):
         evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=replace(half, seed=7))
 
 
 def test_the_front_has_no_candidate_that_another_beats() -> None:
     def candidate(rules: int, error: float) -> Candidate:
-        return Candidate(START, error, rules, ())
+        return Candidate(START, error, rules)
 
     front = pareto([candidate(*x) for x in ((3, 2.0), (3, 1.5), (5, 1.5), (7, 1.0), (9, 1.2))])
     assert [(c.rules, c.error) for c in front] == [(3, 1.5), (7, 1.0)]

@@ -7,7 +7,6 @@ import torch
 
 from nfriction.papers.controller.fis import load_fis, parse_fis
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rules import format_rules, parse_rules
 
 FLOAT64 = torch.float64
 
@@ -94,15 +93,6 @@ def test_or_is_the_stronger_of_both_conditions() -> None:
     ]
     x = torch.tensor([[8.0, -5.0]], dtype=FLOAT64)  # fast, not driving
     assert controller._rule_strengths(x)[1:3].amax().item() == 0.5
-
-
-def test_an_import_survives_our_own_format(tmp_path: Path) -> None:
-    (tmp_path / "joint.fis").write_text(TEXT)
-    rules = load_fis(tmp_path / "joint.fis", units=("rad/s", "rad/s^2"))
-    again = parse_rules(format_rules(rules))
-    assert again == rules
-    x = torch.rand(50, 2, dtype=FLOAT64, generator=torch.Generator().manual_seed(0)) * 10
-    assert torch.equal(MamdaniController(again).infer(x), MamdaniController(rules).infer(x))
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,21 @@
 """Laws of normal equations from columns that outputs share, on the layers that offer them."""
 
-from collections.abc import Mapping
-
 import pytest
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
+from nfriction.fuzzy import Anfis, RBFNetwork
+from nfriction.papers.nffem import jacobian
 from nfriction.papers.nffem.evidence import EvidenceOptions, bayesian_regularisation
 from nfriction.papers.nffem.jacobian import (
     CHUNK_ENTRIES,
     NormalEquations,
+    assign,
+    flatten,
     normal_equations,
-    shares_columns,
     trainable,
 )
-from tests.papers.nffem.networks import F64, RadialBasis, noise
+from tests.papers.nffem.networks import F64, noise
 
 LAYERS = {
     "anfis": lambda g: Anfis(g, 2, [3, 2], 2),
@@ -39,9 +39,15 @@ def frozen_first(module: nn.Module) -> nn.Module:
     return module
 
 
-def automatic(model: nn.Module) -> object:
-    """The same function, of which nothing but its values is known."""
-    return lambda values, x: torch.func.functional_call(model, dict(values), (x,))
+class Plain(nn.Module):
+    """Hides what a network offers beyond its outputs."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.network(x)
 
 
 def assert_same(got: NormalEquations, wanted: NormalEquations) -> None:
@@ -72,16 +78,19 @@ def test_columns_and_maps_make_the_jacobian_of_reverse_differentiation(
 
 @pytest.mark.parametrize("groups", [1, 3])
 @pytest.mark.parametrize("kind", LAYERS)
-def test_columns_give_the_normal_equations_of_the_whole_jacobian(kind: str, groups: int) -> None:
+def test_columns_give_the_normal_equations_of_the_whole_jacobian(
+    kind: str, groups: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     layer = shaken(LAYERS[kind](groups))
-    assert shares_columns(layer)
     x, y = noise(0, 101, groups, 2), noise(1, 101, groups, 2)
     for module in (layer, frozen_first(layer)):
-        offset = {name: value + 0.1 for name, value in trainable(module).items()}
-        wanted = normal_equations(automatic(module), offset, x, y)
+        assign(module, flatten(trainable(module)) + 0.1)
+        wanted = normal_equations(Plain(module), x, y)
+        rows = module.jacobian_columns(x[:1]).shape[1] + 2
         # Chunks that do not divide the samples, and all at once.
-        for chunk in (33, None):
-            assert_same(normal_equations(module, offset, x, y, chunk), wanted)
+        for entries in (33 * groups * rows, CHUNK_ENTRIES):
+            monkeypatch.setattr(jacobian, "CHUNK_ENTRIES", entries)
+            assert_same(normal_equations(module, x, y), wanted)
 
 
 def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
@@ -99,17 +108,7 @@ def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
     fit = bayesian_regularisation(ours, x, y, options=EvidenceOptions(max_steps=15))
     assert calls >= 16
 
-    class Plain(nn.Module):
-        """Hides what the network offers beyond its outputs."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = plain
-
-        def forward(self, x: Tensor) -> Tensor:
-            return self.network(x)
-
-    same = bayesian_regularisation(Plain(), x, y, options=EvidenceOptions(max_steps=15))
+    same = bayesian_regularisation(Plain(plain), x, y, options=EvidenceOptions(max_steps=15))
     # Rounding, grown over 15 steps of a nonlinear search.
     assert fit.log_evidence == pytest.approx(same.log_evidence, rel=1e-6)
     torch.testing.assert_close(fit.w, same.w, rtol=1e-5, atol=1e-6)
@@ -124,17 +123,15 @@ def test_the_columns_of_a_long_recording_stay_in_bounded_memory() -> None:
             return super().jacobian_columns(x, out)
 
     network = Watched(1)
-    normal_equations(network, trainable(network), noise(0, 50_000, 1, 2), noise(1, 50_000, 1, 2))
+    normal_equations(network, noise(0, 50_000, 1, 2), noise(1, 50_000, 1, 2))
     assert sum(sizes) == 50_000
     assert max(sizes) * (10 + 1 + 40 + 2) <= CHUNK_ENTRIES
 
 
-def test_misfits_and_modules_without_columns() -> None:
+def test_misfits_are_refused() -> None:
     network, x = RBFNetwork(1, units=3), noise(0, 9, 1, 2)
     with pytest.raises(ValueError, match="must agree"):
-        normal_equations(network, trainable(network), x, noise(1, 9, 1, 3))
-    assert not shares_columns(RadialBasis())
-    assert not shares_columns(AnfisRBF(1, 2, [2, 2], 1))
+        normal_equations(network, x, noise(1, 9, 1, 3))
 
 
 def test_units_far_from_every_sample_cost_no_more() -> None:
@@ -146,11 +143,3 @@ def test_units_far_from_every_sample_cost_no_more() -> None:
     tiny = torch.finfo(F64).tiny
     assert (said.square() >= tiny).all()
     assert said.min() < 1e-100
-
-
-def test_mapping_is_enough_for_functions() -> None:
-    def function(values: Mapping[str, Tensor], x: Tensor) -> Tensor:
-        return values["a"] * x
-
-    found = normal_equations(function, {"a": torch.ones((), dtype=F64)}, noise(0, 5), noise(1, 5))
-    torch.testing.assert_close(found.JtJ[0, 0], noise(0, 5).square().sum(), rtol=1e-14, atol=0)
