@@ -178,30 +178,43 @@ def test_inputs_that_are_given_stay(recorded) -> None:
     assert not fit(model, pendulum(), recording, max_steps=2, **BRIEF).inputs
 
 
-def choice_of(gradient: list[float], hessian: torch.Tensor, lower: float = -9.0) -> _Choice:
-    """A candidate, the second variable, beside one that the law has; a prior of one unit."""
+def choice_of(gradient: float, lower: float = -9.0) -> _Choice:
+    """Errors 20 + g x + 3 x^2 / 2 of a candidate beside a variable of the law; priors of 1."""
+    one, zero = torch.eye(2).double(), torch.zeros(2).double()
+    slope = torch.tensor([0.0, gradient]).double()
     bounds = torch.tensor([0.0, lower]).double(), torch.tensor([0.0, 9.0]).double()
-    local = Quadratic(torch.tensor(20.0).double(), torch.tensor(gradient).double(), hessian)
-    return _Choice(local, torch.ones(2).double(), bounds, {"load": [1]})
+    errors = Quadratic(torch.tensor(20.0).double(), slope, 3.0 * one)
+    return _Choice(errors, Quadratic(0.0, zero, one), bounds, {"load": [1]})
 
 
-def test_evidence_is_the_integral_over_the_coefficient() -> None:
-    # Cost 20 - 6 x + 4 x^2 / 2, of which x^2 / 2 is the prior.
-    choice = choice_of([-2.0, -6.0], torch.diag(torch.tensor([1.0, 4.0])).double())
-    x = torch.linspace(-9.0, 9.0, 20001, dtype=torch.float64)
-    density = torch.exp(6.0 * x - 2.0 * x**2) / (2.0 * torch.pi) ** 0.5
+@pytest.mark.parametrize("scale", [1.0, 5.0])
+def test_evidence_is_the_integral_over_the_coefficient(scale) -> None:
+    choice, x = choice_of(-6.0), torch.linspace(-9.0, 9.0, 20001, dtype=torch.float64)
+    density = torch.exp(scale * (6.0 * x - 1.5 * x**2) - 0.5 * x**2) / (2.0 * torch.pi) ** 0.5
     expected = float(torch.trapezoid(density, x).log())
-    gained = choice.evidence([1])[0] - choice.evidence([])[0]
-    assert gained == pytest.approx(expected, rel=1e-9)
-    assert choice.evidence([1])[1] == pytest.approx(20.0 - 4.5)
+    (after, cost), (before, whole) = choice.evidence([1], scale), choice.evidence([], scale)
+    assert after - before == pytest.approx(expected, rel=1e-9)
+    found = 6.0 * scale / (3.0 * scale + 1.0)
+    assert (cost, whole) == pytest.approx((20.0 - 6.0 * found + 1.5 * found**2, 20.0))
     (gain,) = choice.forward(1.0)
-    assert gain.share == pytest.approx(4.5 / 20.0)
+    assert gain.share == pytest.approx((6.0 * 1.5 - 1.5 * 1.5**2) / 20.0)
 
 
 def test_an_input_that_its_sign_forbids_has_no_evidence() -> None:
-    choice = choice_of([0.0, 6.0], torch.diag(torch.tensor([1.0, 4.0])).double(), lower=0.0)
-    assert choice.evidence([1])[0] < choice.evidence([])[0]
+    choice = choice_of(6.0, lower=0.0)
+    assert choice.evidence([1], 1.0)[0] < choice.evidence([], 1.0)[0]
     assert not choice.forward(0.0)
+
+
+def test_an_input_is_judged_beside_the_noise_that_those_before_leave() -> None:
+    one, zero = torch.eye(2).double(), torch.zeros(2).double()
+    slope = torch.tensor([-18.0, -3.0]).double()
+    bounds = torch.full((2,), -9.0).double(), torch.full((2,), 9.0).double()
+    errors = Quadratic(torch.tensor(18.0).double(), slope, 10.0 * one)
+    choice = _Choice(errors, Quadratic(0.0, zero, one), bounds, {"heat": [0], "load": [1]})
+    # Beside the noise of the law the second gains less than its coefficient costs.
+    assert choice.evidence([1], 1.0)[0] < choice.evidence([], 1.0)[0]
+    assert [gain.name for gain in choice.forward(0.5)] == ["heat", "load"]
 
 
 def test_window_states_are_at_their_best() -> None:

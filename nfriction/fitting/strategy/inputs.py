@@ -202,10 +202,10 @@ def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Local model of the cost over the shared variables, window states at their best."""
+    """Local models of errors and priors over the shared variables, window states at their best."""
 
-    local: Quadratic
-    precision: Tensor  # of the priors
+    errors: Quadratic
+    prior: Quadratic
     bounds: tuple[Tensor, Tensor]  # of a step
     columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
 
@@ -225,22 +225,34 @@ class _Choice:
         local = problem.linearise(x)
         if stopped or not local.finite:
             return None
-        shared = variables.shared_count
+        shared, (precision, mean) = variables.shared_count, variables.prior()
+        off, precision = (x - mean)[:shared], precision[:shared]
+        prior = Quadratic(
+            0.5 * off @ (precision * off), precision * off, torch.diag(precision)
+        )  # fmt: skip
         lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         place = model.law.names.index
         columns = {name: rows[:, place(INPUTS[name].name)].tolist() for name in names}
         bounds = lower.clamp(max=0.0), upper.clamp(min=0.0)
-        return cls(_of_shared(local, shared), variables.prior()[0][:shared], bounds, columns)
+        whole = _of_shared(local, shared)
+        errors = Quadratic(
+            whole.cost - prior.cost, whole.gradient - prior.gradient, whole.hessian - prior.hessian
+        )  # fmt: skip
+        return cls(errors, prior, bounds, columns)
 
     def forward(self, least: float) -> list[InputGain]:
-        """Inputs one after the other, as long as one raises the log evidence by more than this."""
+        """Inputs one after the other, as long as one raises the log evidence by more than this.
+
+        Each is judged beside the noise that those before it leave.
+        """
         chosen: list[InputGain] = []
         held: list[int] = []
         while len(chosen) < len(self.columns):
-            before, left = self.evidence(held)
+            scale = float(self.errors.cost) / self.evidence(held, 1.0)[1] if held else 1.0
+            before, left = self.evidence(held, scale)
             found = {
-                name: self.evidence([*held, *columns])
+                name: self.evidence([*held, *columns], scale)
                 for name, columns in self.columns.items()
                 if columns[0] not in held
             }
@@ -248,31 +260,42 @@ class _Choice:
             if not found[best][0] - before > least:
                 break
             by_joint = tuple(
-                1.0 - self.evidence([*held, column])[1] / left for column in self.columns[best]
+                1.0 - self.evidence([*held, column], scale)[1] / left
+                for column in self.columns[best]
             )
             chosen.append(InputGain(best, 1.0 - found[best][1] / left, by_joint))
             held += self.columns[best]
         return chosen
 
-    def evidence(self, held: Sequence[int]) -> tuple[float, float]:
-        """Log evidence with the columns `held`, up to a constant, and the cost at the minimum.
+    def evidence(self, held: Sequence[int], scale: float) -> tuple[float, float]:
+        """Log evidence with the columns `held`, up to a constant, and the errors' cost.
 
-        By Laplace's approximation at the minimum within the bounds.
+        By Laplace's approximation at the minimum within the bounds. The errors count `scale` times,
+        for a smaller noise than that of the law.
         """
         others = {c for columns in self.columns.values() for c in columns}.difference(held)
-        free = [k for k in range(len(self.precision)) if k not in others]
-        gradient, hessian = self.local.gradient[free], self.local.hessian[free][:, free]
+        free = [k for k in range(len(self.prior.gradient)) if k not in others]
         lower, upper = (bound[free] for bound in self.bounds)
 
-        def model(x: Tensor) -> Quadratic:
+        def at(local: Quadratic, x: Tensor) -> Quadratic:
+            gradient, hessian = local.gradient[free], local.hessian[free][:, free]
             slope = gradient + hessian @ x
-            return Quadratic(self.local.cost + 0.5 * x @ (gradient + slope), slope, hessian)
+            return Quadratic(local.cost + 0.5 * x @ (gradient + slope), slope, hessian)
 
-        end = LevenbergMarquardt().minimise(model, 0.0 * gradient, lower=lower, upper=upper)
-        moved = lower < upper
-        spread = torch.linalg.slogdet(hessian[moved][:, moved]).logabsdet
-        cost, prior = float(model(end.x).cost), float(self.precision[list(held)].log().sum())
-        return 0.5 * (prior - float(spread)) - cost, cost
+        def model(x: Tensor) -> Quadratic:
+            errors, prior = at(self.errors, x), at(self.prior, x)
+            return Quadratic(
+                scale * errors.cost + prior.cost, scale * errors.gradient + prior.gradient,
+                scale * errors.hessian + prior.hessian,
+            )  # fmt: skip
+
+        start = torch.zeros(len(free), dtype=torch.float64)
+        end = LevenbergMarquardt().minimise(model, start, lower=lower, upper=upper)
+        least, moved = model(end.x), lower < upper
+        spread = torch.linalg.slogdet(least.hessian[moved][:, moved]).logabsdet
+        known = self.prior.hessian.diagonal()[list(held)].log().sum()
+        evidence = float(0.5 * (known - spread) - least.cost)
+        return evidence, float(at(self.errors, end.x).cost)
 
 
 def _of_shared(local: Quadratic, shared: int) -> Quadratic:
