@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -12,11 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.papers.afem.adaptive import CLASSES, Adaptive
+from nfriction.papers.afem.adaptive import CLASSES, Adaptive, peak_envelope
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
+# By recording, by joint: (class, start [s], end [s]).
+Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
 
 # With less variation than this ratio the windowed peak has no classes.
 LEAST_VARIATION = 1.5
@@ -33,6 +35,7 @@ class ClassOptions:
 
     Attributes:
         thresholds: given ones [rad/s^2], (joint, 2) or (2,).
+        intervals: given ones, by recording and joint; samples outside belong to the nearest.
         window: length of the moving window [s], longer than half a swing.
         least: a class with less data than this takes its neighbour's coefficients [s].
         prior_sd: standard deviation of a class around the constant law, in units of a coefficient
@@ -43,6 +46,7 @@ class ClassOptions:
     """
 
     thresholds: Tensor | Sequence | None = None
+    intervals: Intervals | None = None
     window: float = 1.0
     least: float = 0.5
     prior_sd: float = 0.5
@@ -92,7 +96,8 @@ def find_classes(
 
     Two thresholds divide the logarithm of the peak of |qdd| within a moving window so that the
     variance within the three classes is least (Otsu). The class of each sample is then the one
-    that the schedule has there.
+    that the schedule has there; with given intervals it is theirs, and the thresholds are those
+    that separate these intervals best.
 
     Args:
         schedule: its thresholds, swing rate and sample time are set.
@@ -102,8 +107,8 @@ def find_classes(
         options: given classes, or how to find them.
 
     Raises:
-        ValueError: if no joint's acceleration varies enough to have classes, or sample times
-            differ.
+        ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
+            or intervals name what is not there.
     """
     step = _sample_time(recordings)
     schedule.set_sample_time(step)
@@ -113,11 +118,16 @@ def find_classes(
     rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
     # In the words of the status of the fit, which repeats them.
     notes: list[str] = []
-    thresholds = options.thresholds
-    if thresholds is None:
+    labels, thresholds = None, options.thresholds
+    if options.intervals is not None:
+        labels = [_labels(options.intervals, r, joints) for r in recordings]
+        envelopes = [peak_envelope(a.abs(), schedule.fading) for a in qdd]
+        thresholds = _separating(labels, envelopes)
+    elif thresholds is None:
         thresholds = _by_otsu(qdd, step, options.window, joints, notes)
     schedule.set_classes(thresholds, rate.nan_to_num(0.0, 0.0))
-    labels = [schedule.classes(v, a) for v, a in zip(qd, qdd, strict=True)]
+    if labels is None:
+        labels = [schedule.classes(v, a) for v, a in zip(qd, qdd, strict=True)]
     together = torch.cat(labels)
     seconds = torch.stack([(together == c).sum(0) for c in range(len(CLASSES))], -1) * step
     return AccelerationClasses(
@@ -175,8 +185,8 @@ def _by_otsu(
         raise ValueError(
             "the acceleration hardly varies, so it has no classes: its peak within "
             f"{window:g} s goes from {peaks.min(0).round(3).tolist()} to "
-            f"{highest.round(3).tolist()} rad/s^2. Give `thresholds`, recordings of more "
-            "varied motion, or fit the constant law."
+            f"{highest.round(3).tolist()} rad/s^2. Give `thresholds` or `intervals`, recordings "
+            "of more varied motion, or fit the constant law."
         )
     found = []
     for j, name in enumerate(joints):
@@ -188,6 +198,53 @@ def _by_otsu(
             low, high = otsu(np.log(peaks[:, j]))
             found.append((float(np.exp(low)), float(np.exp(high))))
     return found
+
+
+def _labels(intervals: Intervals, recording: Recording, joints: Sequence[str]) -> Tensor:
+    """Class of every sample, from given intervals."""
+    own = intervals.get(recording.name)
+    if own is None or set(own) != set(joints):
+        raise ValueError(
+            f"`intervals` must give {recording.name!r} and its joints {list(joints)}, got "
+            f"{ {name: list(of) for name, of in intervals.items()} }."
+        )
+    columns = []
+    for joint in joints:
+        for known, start, end in own[joint]:
+            if known not in CLASSES or not end > start:
+                raise ValueError(
+                    f"an interval is (class, start, end) with a class of {CLASSES} and end > "
+                    f"start [s], got {(known, start, end)} for {joint}."
+                )
+        time = recording.time
+        starts, ends = (np.array([row[i] for row in own[joint]])[:, None] for i in (1, 2))
+        # Distance to each interval, so that samples between two belong to the nearer one.
+        gap = np.maximum(np.maximum(starts - time, time - ends), 0.0)
+        gap[(time >= starts) & (time < ends)] = -1.0
+        order = np.array([CLASSES.index(known) for known, _, _ in own[joint]])
+        columns.append(torch.as_tensor(order[gap.argmin(0)]))
+    return torch.stack(columns, -1)
+
+
+def _separating(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor:
+    """Thresholds of the envelope that agree best with given labels, (joint, 2)."""
+    known, envelope = torch.cat(list(labels)), torch.cat(list(envelopes)).clamp_min(STILL)
+    rows = []
+    for of_joint, size in zip(known.T, envelope.T, strict=True):
+        ends = size.aminmax()
+        low, high = (float(e.log10()) for e in ends)
+        # Accelerations span decades; a linear grid would not resolve the lower threshold.
+        grid = torch.logspace(low, high, 200, dtype=size.dtype)
+        above = size[:, None] > grid
+        row = []
+        for border in range(2):
+            upper = of_joint > border
+            # Both sides have the same weight, however long they lasted.
+            wrong = above[~upper].double().mean(0).nan_to_num()
+            wrong += (~above)[upper].double().mean(0).nan_to_num()
+            row.append(float(grid[int(wrong.argmin())]))
+        rows.append([row[0], max(row)])
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def _merged(seconds: Tensor, least: float, joints: Sequence[str], notes: list[str]) -> Tensor:

@@ -55,6 +55,27 @@ def test_a_dying_motion_goes_through_all_classes_in_time():
     assert schedule.sample_time == pytest.approx(STEP)
 
 
+def test_given_intervals_are_taken_and_their_thresholds_tell_them_apart():
+    given = {"swing": {"a": [("high", 0, 7), ("medium", 7, 14), ("low", 14, 25)],
+                       "b": [("low", 0, 1.3), ("high", 1.3, 6), ("low", 14, 30)]}}  # fmt: skip
+    recording, motion = swinging(*DYING)
+    schedule, classes = found_in((recording, motion), intervals=given)
+    labels = classes.labels[0]
+    at = {t: labels[round(t / STEP)].tolist() for t in (0.5, 5.0, 13.0, 29.0)}
+    # Outside every interval the nearest one holds.
+    assert at == {0.5: [2, 0], 5.0: [2, 2], 13.0: [1, 0], 29.0: [0, 0]}
+    known = schedule.classes(torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd))
+    assert float((known[:, 0] == labels[:, 0]).double().mean()) > 0.9
+    for wrong in (
+        {"other": given["swing"]},
+        {"swing": {"a": given["swing"]["a"]}},
+        {"swing": {**given["swing"], "b": [("tall", 0, 1)]}},
+        {"swing": {**given["swing"], "b": [("low", 2, 1)]}},
+    ):
+        with pytest.raises(ValueError, match="interval"):
+            found_in((recording, motion), intervals=wrong)
+
+
 def test_given_thresholds_are_kept():
     schedule, _ = found_in(swinging(*DYING), thresholds=[[10.0, 100.0], [5.0, 50.0]])
     assert schedule.thresholds.tolist() == [[10.0, 100.0], [5.0, 50.0]]
