@@ -240,25 +240,25 @@ def fit_memory(
     return fit, found.errors
 
 
-def predict(model: FrictionModel, joint: JointTorque) -> Tensor:
+def predict(model: FrictionModel, joint: JointTorque, lead_in: float = LEAD_IN) -> Tensor:
     """Friction torque of a model of one joint at the rows of a table, (row,) [N m; N].
-
-    The torque of the lead-in shows a law with memory how far it was deflected before.
 
     Args:
         model: of one joint.
         joint: rows; in order of time for a law with memory.
+        lead_in: time from the first row [s] whose torque shows a law with memory how far it was
+            deflected before; 0 begins without deflection.
     """
     require_load(type(model).__name__, joint, model)
     if model.law.memory is not None:
-        return _remembered(model, model.law.memory, joint)
+        return _remembered(model, model.law.memory, joint, lead_in)
     with torch.no_grad():
         torque: Tensor = model(*_columns(joint)[:3])[:, 0]
         return torque
 
 
 @torch.no_grad()
-def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque) -> Tensor:
+def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_in: float) -> Tensor:
     """Torque of a law with memory along rows in order of time."""
     if joint.time is None:
         raise ValueError(f"a law with memory needs the time of the rows of {joint.name}.")
@@ -275,7 +275,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque) -> Ten
 
     still = torch.zeros(1, 1, memory.size).double()
     # A table to predict may have no torque, which then shows nothing.
-    seen = LEAD_IN if bool(tau.isfinite().all()) else 0.0
+    seen = lead_in if bool(tau.isfinite().all()) else 0.0
     first = slice(int(np.searchsorted(joint.time, joint.time[0] + seen)))
     if first.stop:
         names, reach = model.law.names, max(range_of(joint), 1e-12)
