@@ -126,9 +126,8 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
-    horizon, longest = (
-        start.longest_usable_horizon(task.options.windows), longest_duration(task.motions)
-    )  # fmt: skip
+    horizon = start.longest_usable_horizon(task.options.windows)
+    longest = longest_duration(task.motions)
     ends: list[HorizonResult] = []
 
     def residual(log_time: float) -> float:
