@@ -169,6 +169,7 @@ class FrictionEstimator(BaseEstimator):
                 recording, whose time moves it.
         """
         model, plant = self._fitted.model, self._fitted.plant
+        time: torch.Tensor | None = None
         with torch.no_grad():
             if isinstance(X, Recording | pd.DataFrame | str | os.PathLike):
                 (recording,) = _recordings(X, plant)
@@ -178,8 +179,8 @@ class FrictionEstimator(BaseEstimator):
                 q, velocity, acceleration = map(torch.tensor, (motion.q, motion.qd, motion.qdd))
                 tau = torch.zeros_like(q) if joint.tau is None else torch.tensor(joint.tau)
                 loads = load_of(model.law, plant, q, velocity, tau)
+                time = torch.tensor(joint.time)
                 if model.law.memory:
-                    time = torch.tensor(joint.time)
                     states, held = deflections(model, time, velocity, acceleration, loads)
                     return model.law.memory.torque(states, velocity, loads, held).numpy()
             else:
@@ -191,7 +192,7 @@ class FrictionEstimator(BaseEstimator):
                     for given, name, default in ((qdd, "qdd", 0.0), (load, "load", 1.0))
                 )
             if model.state_size:
-                states = model.schedule.states(velocity, acceleration)
+                states = model.schedule.states(velocity, acceleration, time)
                 held = model.coefficients_from(velocity, acceleration, states)
                 return model.torque(velocity, loads, held).numpy()
             return model(velocity, acceleration, loads).numpy()

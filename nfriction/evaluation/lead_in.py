@@ -166,7 +166,7 @@ class Simulator:
             motion = _causal_motion(plant, recording)
             q, qd, qdd = (torch.tensor(x) for x in (motion.q, motion.qd, motion.qdd))
             if friction.state_size:
-                self.states = friction.schedule.states(qd, qdd)
+                self.states = friction.schedule.states(qd, qdd, torch.tensor(self.time))
             if friction.law.memory:
                 time = torch.tensor(self.time)
                 tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)

@@ -309,6 +309,8 @@ def contract_of(
         **describe(model, info),
         # Of a law with memory its state is given out, too.
         "coefficients": describe(controller.model, info)["coefficients"],
+        # A hidden state advances by it, also where nobody gave one.
+        "sample_time": info.sample_time or getattr(model.schedule, "sample_time", None),
         "format": FORMAT,
         "schema": SCHEMA,
         "dtype": dtype,

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.heat import Heated
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.sampled import sampled
 from nfriction.io.files import numbers
@@ -63,6 +64,9 @@ def controller_of(
                 "`ModelInfo.sample_time` [s], got None."
             )
         model = sampled(model, info.sample_time)
+    if info.sample_time is not None and isinstance(model.schedule, Heated):
+        model = copy.deepcopy(model)
+        model.schedule = model.schedule.at_sample_time(info.sample_time)
     if not with_filter:
         return Controller(model, info, torque_limit)
     if info.sample_time is None:

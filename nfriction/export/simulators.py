@@ -251,10 +251,10 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
             f"damping and friction loss have no memory, and the law {model.law.name!r} has: export "
             "a model without, such as coulomb-viscous."
         )
-    q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
+    time, q, qd, qdd = map(torch.as_tensor, (motion.time, motion.q, motion.qd, motion.qdd))
     weight = torch.ones_like(qd) if load is None else load(q, qd)
     schedule = model.schedule
-    states = schedule.states(qd, qdd)
+    states = schedule.states(qd, qdd, time)
     return model.torque(qd, weight, schedule.coefficients_from(qd, qdd, states))
 
 

@@ -404,14 +404,15 @@ def coefficient_scale(
 ) -> Tensor:
     """Size of each coefficient that alone would explain a third of the friction torque, in SI.
 
-    Shape (joint, coefficient); zero where the torque is not linear in the coefficient.
+    Shape (joint, coefficient); zero where the torque is not linear in the coefficient, or where
+    the coefficient belongs to a hidden state.
     """
     pairs = zip(recordings, motions, strict=True)
     torque = torch.cat([friction_torque(plant, r, m)[2] for r, m in pairs]).square().mean(0).sqrt()
     rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
     columns = []
     for c in model.law.coefficients:
-        if not c.linear:
+        if not c.linear or c.stores:
             columns.append(torch.zeros_like(rms))
         elif c.unit.endswith("s/rad"):
             columns.append(torque / rms / 3)

@@ -101,11 +101,16 @@ class Schedule(nn.Module, ABC):
         coefficients: Tensor = self(qd, qdd)
         return coefficients
 
-    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Hidden state after every sample of a motion (sample, joint): (sample, joint, state)."""
-        return self.states_from(self.initial_state(qd[0], qdd[0]), qd, qdd)
+    def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
+        """Hidden state after every sample of a motion (sample, joint): (sample, joint, state).
 
-    def states_from(self, first: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        Heat follows the `time` of the samples [s], if given, and cools in gaps.
+        """
+        return self.states_from(self.initial_state(qd[0], qdd[0]), qd, qdd, time)
+
+    def states_from(
+        self, first: Tensor, qd: Tensor, qdd: Tensor, time: Tensor | None = None
+    ) -> Tensor:
         """The same with the state after the first sample given, (*batch, joint, state)."""
         # One by one, as each state needs the one before; a subclass may know a faster way.
         rows = [first]

@@ -4,14 +4,15 @@ The heat h of a joint is a leaky integral of the power P that its friction dissi
 
     h' = P / C - h / T,
 
-relative to the largest that the recordings of a fit reached, and friction falls by exp(-k_h h):
-the viscosity of lubricants falls exponentially with temperature. P is taken at the load at rest. A
-motion starts cold unless a hidden state is given.
+and friction falls by exp(-k_h h): the viscosity of lubricants falls exponentially with temperature.
+h has no unit; a fit takes the C with which cold friction would heat its recordings to 1 at most. P
+is taken at the load at rest. A motion starts cold unless a hidden state is given.
 
 References:
     O. Reynolds, Phil. Trans. R. Soc. 177 (1886), 157-234, for the viscosity.
 """
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -76,16 +77,25 @@ class Heated(Schedule):
         Raises:
             ValueError: if one of them is not positive and finite.
         """
-        given = torch.as_tensor(capacity, dtype=torch.float64).expand(self.joints)
+        given = torch.as_tensor(capacity, dtype=torch.float64)
+        if given.shape not in ((), (1,), (self.joints,)):
+            raise ValueError(
+                f"`capacity` must be a number or one for each of {self.joints} joints, got "
+                f"shape {tuple(given.shape)}."
+            )
+        given = given.expand(self.joints)
         for value in given.tolist():
             positive_number("capacity", value, "J")
         self.log_heat_capacity.copy_(given.log())
         self.log_cooling_time.fill_(math.log(positive_number("cooling_time", cooling_time, "s")))
         self.log_sample_time.fill_(math.log(positive_number("sample_time", sample_time, "s")))
 
-    def set_sample_time(self, sample_time: float) -> None:
-        """Set the time between samples [s]."""
-        self.set_heat(self.heat_capacity, self.cooling_time, sample_time)
+    def at_sample_time(self, sample_time: float) -> Schedule:
+        """A copy with the same parameters that advances by another sample time [s]."""
+        moved = copy.copy(self)
+        log_time = torch.full_like(self.log_sample_time, math.log(sample_time))
+        moved._buffers = {**self._buffers, "log_sample_time": log_time}
+        return moved
 
     def take_heat(self, other: "Heated") -> None:
         """Take capacity, cooling time and sample time of another schedule."""
@@ -96,11 +106,15 @@ class Heated(Schedule):
 
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         held = self.coefficients_from(qd, qdd, state)
-        # With a sharp sign, as a joint at rest has no power.
-        power = qd * self.law_torque(qd, torch.ones_like(qd), held, 1e-9)
+        power = self._power(qd, held)
         kept = torch.exp(-torch.exp(self.log_sample_time - self.log_cooling_time))
         gained = torch.exp(self.log_sample_time - self.log_heat_capacity) * power
         return (kept * state.select(-1, 0) + gained).unsqueeze(-1)
+
+    def _power(self, qd: Tensor, coefficients: Tensor) -> Tensor:
+        """Power that friction dissipates [W]; none where it drives."""
+        # With a sharp sign, as the power of dry friction is |qd| F_c down to rest.
+        return (qd * self.law_torque(qd, torch.ones_like(qd), coefficients, 1e-9)).clamp_min(0.0)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         cold = self(qd, qdd)
@@ -108,16 +122,22 @@ class Heated(Schedule):
         return torch.cat([cold[..., :-1] + 0.0 * state, state], -1)
 
     @torch.no_grad()
-    def states_from(self, first: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+    def states_from(
+        self, first: Tensor, qd: Tensor, qdd: Tensor, time: Tensor | None = None
+    ) -> Tensor:
         # As `advance` from sample to sample, with the power of cold friction from one call.
         cold = self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
-        power = qd * self.law_torque(qd, torch.ones_like(qd), cold, 1e-9)
-        gained = (self.sample_time / self.heat_capacity * power).numpy()
-        falls, kept = cold[..., -2].numpy(), math.exp(-self.sample_time / self.cooling_time)
+        steps = np.full(len(qd) - 1, self.sample_time)
+        if time is not None and len(steps):
+            steps = np.diff(time.numpy())
+        # In a gap a joint cools; how it moves then is not known.
+        step = np.median(steps) if len(steps) else self.sample_time
+        gained = (step / self.heat_capacity * self._power(qd, cold)).numpy()
+        falls, kept = cold[..., -2].numpy(), np.exp(-steps / self.cooling_time)
         rows = np.empty_like(gained)
         rows[0] = first[..., 0]
         for k in range(1, len(rows)):
-            rows[k] = kept * rows[k - 1] + gained[k] * np.exp(-falls[k] * rows[k - 1])
+            rows[k] = kept[k - 1] * rows[k - 1] + gained[k] * np.exp(-falls[k] * rows[k - 1])
         return torch.from_numpy(rows)[..., None]
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, SupportsIndex
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
@@ -22,6 +23,8 @@ from nfriction.fuzzy.partition import FreePartition
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
+# One that no fit varies need not rise, such as the fall by heat of a joint that has none.
+NO_RATIO = 1e-6
 # With a third of it the network is too stiff to follow large swings, and then wrong at smaller
 # ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
 PRIOR_SD = 0.3
@@ -130,11 +133,16 @@ class NeuroFuzzy(Schedule):
                 f"acceleration, got {reprlib.repr(terms)}."
             )
         k = len(law.names)
+        # The last coefficients of some laws no fit varies, such as those of heat.
+        self.outputs = max(i + 1 for i, varied in enumerate(self.fitted_mask) if varied)
+        self.kept = k - self.outputs
         self.terms, self.head_units = tuple(terms), head_units
         self.interpretable = bool(interpretable)
         self.along_motion = acceleration == "along_motion"
         self.prior_sd = positive_number("prior_sd", prior_sd)
-        self.network = AnfisRBF(joints, 2, terms, k, units=head_units, interpretable=interpretable)
+        self.network = AnfisRBF(
+            joints, 2, terms, self.outputs, units=head_units, interpretable=interpretable
+        )
         self.network.init_grid(0.0, 1.0)
         for name in ("reference", "scale"):
             self.register_buffer(name, torch.ones(joints, k, dtype=torch.float64))
@@ -155,7 +163,12 @@ class NeuroFuzzy(Schedule):
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         x, weight = self._clamped_inputs(qd, qdd)
-        return self.to_coefficients(self.reference + weight * self.network(x))
+        return self.to_coefficients(self.reference + weight * self.deviation(x))
+
+    def deviation(self, x: Tensor) -> Tensor:
+        """Deviation from the reference at inputs within the range, (*batch, joint, coefficient)."""
+        found = self.network(x)
+        return pad(found, [0, self.kept]) if self.kept else found
 
     def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
@@ -185,7 +198,7 @@ class NeuroFuzzy(Schedule):
         # Every pair of centres is a sample, all joints at once; the acceleration varies faster.
         v, a = (c.clamp(0.0, 1.0).T for c in centres)
         pairs = [v.repeat_interleave(self.terms[1], 0), a.repeat(self.terms[0], 1)]
-        found = self.to_coefficients(self.reference + self.network(torch.stack(pairs, -1)))
+        found = self.to_coefficients(self.reference + self.deviation(torch.stack(pairs, -1)))
         span = (upper - lower)[..., None]
         return FuzzyRules(
             lower,
@@ -215,7 +228,9 @@ class NeuroFuzzy(Schedule):
         # A coefficient of zero has no size to be a unit.
         self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
-        lifted = smooth_relu_inverse(ratio.clamp_min(least), self.roundness)
+        lowest = torch.full_like(ratio, least)
+        lowest[:, self.outputs :] = NO_RATIO
+        lifted = smooth_relu_inverse(ratio.maximum(lowest), self.roundness)
         self.reference.copy_(torch.where(self.positive, lifted, ratio))
 
     @torch.no_grad()
@@ -294,7 +309,7 @@ class NeuroFuzzy(Schedule):
             f"{name} of {joint}: {part}"
             for parts in (planes, head)
             for joint in joint_names
-            for name in self.coefficient_names
+            for name in self.coefficient_names[: self.outputs]
             for part in parts
         ]
         for group, p in zip(self.group_names()[2:], self.trained()[2:], strict=True):
@@ -319,7 +334,7 @@ class NeuroFuzzy(Schedule):
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         # The network of a coefficient that is not fitted stays where it started.
-        mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
+        mask = torch.tensor(self.fitted_mask[: self.outputs], device=vector.device)[:, None]
         fitted = torch.ones_like(vector, dtype=torch.bool)
         linear = [mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.weights()]
         fitted[: sum(len(part) for part in linear)] = torch.cat(linear)
@@ -381,7 +396,8 @@ class NeuroFuzzy(Schedule):
         weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
-        return by_x + self.network(x)[..., None] * slope[..., None, :]
+        by_x = by_x + self.network(x)[..., None] * slope[..., None, :]
+        return pad(by_x, [0, 0, 0, self.kept])
 
     @torch.no_grad()
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
@@ -391,13 +407,15 @@ class NeuroFuzzy(Schedule):
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             # The map to coefficients is elementwise, so the sum's gradient is its slope.
-            u = (self.reference + weight * (y + head(both))).detach().requires_grad_()
+            u = weight * pad(y + head(both), [0, self.kept])
+            u = (self.reference + u).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
-        own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
+        own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
         # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
+        by_y = pad(by_y, [0, 0, 0, self.kept])
         by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
         if not self.learn_sets:
@@ -406,7 +424,7 @@ class NeuroFuzzy(Schedule):
         columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
         shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
         by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
-        by_unit = by_u[..., None] * head.output_weight.repeat_interleave(head.inputs, -1)
+        by_unit = by_head @ head.output_weight.repeat_interleave(head.inputs, -1)
         # Of a unit's output by its centre and logarithmic width, both over the width squared.
         moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
         moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]

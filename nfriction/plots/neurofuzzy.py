@@ -192,9 +192,9 @@ def coefficients_over_time(
 
 def _along(model: FrictionModel, motion: Motion) -> Array:
     """Coefficients at every sample, (sample, joint, coefficient)."""
-    qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
+    qd, qdd, time = (torch.tensor(x) for x in (motion.qd, motion.qdd, motion.time))
     with torch.no_grad():
-        found = model.coefficients_from(qd, qdd, model.schedule.states(qd, qdd))
+        found = model.coefficients_from(qd, qdd, model.schedule.states(qd, qdd, time))
     return found.expand(len(qd), -1, -1).numpy()
 
 

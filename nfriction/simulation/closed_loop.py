@@ -21,6 +21,7 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     as_stateful,
+    at_sample_time,
 )
 from nfriction.simulation.rollout import simulate
 from nfriction.simulation.validate import (
@@ -140,6 +141,7 @@ def control(
     """
     model = NoFriction(plant.joints) if friction is None else friction
     sample_time, substeps = electronics.sample_time, electronics.substeps
+    model = at_sample_time(model, sample_time)
     given = with_states(
         validate_inputs(plant, model, q0, qd0, None, sample_time, steps, substeps), model
     )

@@ -22,6 +22,7 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     StepFunction,
+    at_sample_time,
 )
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
@@ -102,6 +103,7 @@ def rollout(
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
+    model = at_sample_time(model, float(inputs.step.mean()))
     inputs = with_states(inputs, model, hidden_state, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")

@@ -81,7 +81,8 @@ def simulate_stiction(
     if given or isinstance(friction, NoFriction) or as_stateful(friction) is not None:
         raise ValueError(
             '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
-            'drive or coefficients with a hidden state; use scheme="rk4" for these.'
+            "drive or coefficients with a hidden state (adaptive ones, and those of the input "
+            '"heat"); use scheme="rk4" for these.'
         )
     as_double = {name: getattr(inputs, name).double() for name in ("q0", "qd0", "tau", "step")}
     double = replace(inputs, **as_double)

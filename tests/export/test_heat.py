@@ -9,6 +9,8 @@ from torch import Tensor
 
 from nfriction import ModelInfo, export
 from nfriction.export.c_file import c_runner, find_compiler
+from nfriction.export.contract import contract_of
+from nfriction.export.controller import controller_of
 from tests.friction.samples import motion, warming_network
 
 MODEL, INFO = warming_network(), ModelInfo(sample_time=2e-3)
@@ -35,6 +37,15 @@ def test_c_heats_as_the_model_does_and_starts_cold_after_a_reset(tmp_path: Path)
         np.testing.assert_allclose(coefficients[..., -1], heat, rtol=1e-12, atol=1e-15)
         assert not (status & 2).any()
     assert heat[-1].min() > 0.05
+
+
+@pytest.mark.parametrize(("info", "expected"), [(ModelInfo(sample_time=1e-3), 1e-3), (None, 2e-3)])
+def test_an_export_heats_by_the_sample_time_that_it_states(info, expected: float) -> None:
+    controller = controller_of(MODEL, info)
+    assert controller.model.schedule.sample_time == pytest.approx(expected)
+    description = contract_of(MODEL, controller, info).description
+    assert description["sample_time"] == pytest.approx(expected)
+    assert MODEL.schedule.sample_time == pytest.approx(2e-3)
 
 
 def test_torchscript_heats_as_the_model_does(tmp_path: Path) -> None:

@@ -86,6 +86,58 @@ def test_a_motion_continues_with_the_heat_that_it_had() -> None:
     torch.testing.assert_close(half.q[-1], whole.q[-1], rtol=0, atol=1e-9)
 
 
+def test_heat_follows_the_time_of_samples() -> None:
+    model, (qd, qdd, _) = warming(), motion(300, 2)
+    time = STEP * torch.arange(300, dtype=F64)
+    regular = model.schedule.states(qd, qdd)
+    torch.testing.assert_close(model.schedule.states(qd, qdd, time), regular)
+    # In a gap of 4 s joints cool.
+    late = time + 4.0 * (torch.arange(300) >= 200)
+    found = model.schedule.states(qd, qdd, late)
+    torch.testing.assert_close(found[:200], regular[:200])
+    assert (found[200] < 1.3 * math.exp(-4.0 / 3.0) * regular[199]).all()
+    # At half the rate the same samples last twice as long.
+    slow = model.schedule.states(qd, qdd, 2 * time)
+    torch.testing.assert_close(slow, model.schedule.at_sample_time(2 * STEP).states(qd, qdd))
+    assert (slow[-1] > 1.2 * regular[-1]).all()
+
+
+def test_a_simulation_heats_alike_at_any_sample_time() -> None:
+    plant, model = pendulum(normal_load="bearing"), warming()
+    start = torch.tensor([2.0, 0.5], dtype=F64)
+    ends = [
+        rollout(plant, model, start, 0 * start, sample_time=step, steps=round(2.0 / step)).q[-1]
+        for step in (STEP, 0.5 * STEP, 1.25 * STEP)
+    ]
+    cold = rollout(plant, warming(0.0), start, 0 * start, sample_time=STEP, steps=1000).q[-1]
+    assert (cold - ends[0]).abs().max() > 0.05
+    for end in ends[1:]:
+        torch.testing.assert_close(end, ends[0], rtol=0, atol=2e-3)
+    assert model.schedule.sample_time == pytest.approx(STEP)
+    model.requires_grad_(True)
+    run = rollout(plant, model, start, 0 * start, sample_time=1e-3, steps=50)
+    run.q[-1].sum().backward()
+    assert sum(p.grad.abs().sum() for p in model.parameters()) > 0
+
+
+def test_friction_that_drives_does_not_cool() -> None:
+    law = with_inputs(COULOMB_VISCOUS, ["direction", "heat"])
+    schedule = HeatedConstant(law, 1, [0.02, 0.0, 0.3, 0.5, 0.0])
+    schedule.set_heat(0.01, 1.0, STEP)
+    backwards = -torch.ones(400, 1, dtype=F64)
+    assert not schedule.states(backwards, 0 * backwards).any()
+    assert not schedule.advance(backwards[0], backwards[0], torch.zeros(1, 1, dtype=F64)).any()
+
+
+def test_the_fall_of_a_joint_without_heat_stays_where_a_fit_left_it() -> None:
+    model = NFCVFM(1, inputs=["heat"])
+    model.schedule.set_reference(
+        torch.tensor([[1.0, 0.1, 1e-12, 0.0]], dtype=F64),
+        torch.tensor([[2000.0, 500.0, 0.0, 0.0]], dtype=F64),
+    )
+    assert float(model.schedule.reference_coefficients()[0, 2]) < 2e-6
+
+
 def test_a_model_file_keeps_the_heat(tmp_path) -> None:
     model = warming_network()
     again = load(save(model, tmp_path / "m.json"))
@@ -106,6 +158,11 @@ def test_a_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
 def test_heat_is_refused_where_a_constant_is_not_positive(given) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         warming().schedule.set_heat(*given)
+
+
+def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"each of 2 joints, got shape \(3,\)"):
+        warming().schedule.set_heat([1.0, 2.0, 3.0], 1.0, 1.0)
 
 
 def test_the_papers_network_refuses_heat() -> None:

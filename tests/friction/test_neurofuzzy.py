@@ -13,6 +13,7 @@ from torch.func import functional_call, jacrev
 
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
+from nfriction.friction.memory import ELASTO_PLASTIC
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NFCVFM, NeuroFuzzy
 from nfriction.io.model_file import load, save
@@ -78,7 +79,7 @@ def test_without_an_offset_it_never_drives(law, acceleration: str, seed: int, sp
 @torch.no_grad()
 def silence_offset(schedule: NeuroFuzzy) -> None:
     """Keep signed coefficients at zero, as a user without an offset would."""
-    signed = ~schedule.positive
+    signed = ~schedule.positive[: schedule.outputs]
     schedule.network.anfis.consequents[:, signed] = 0.0
     schedule.network.head.output_weight[:, signed] = 0.0
     schedule.network.head.output_bias[:, signed] = 0.0
@@ -204,19 +205,26 @@ def test_the_prior_pulls_to_the_reference() -> None:
     torch.testing.assert_close(schedule(*motion(5, 2)[:2]), expected, rtol=1e-14, atol=0)
 
 
-def test_a_coefficient_that_is_not_fitted_stays_constant() -> None:
-    schedule = NeuroFuzzy(STRIBECK, 2)
+@pytest.mark.parametrize(
+    ("law", "constant", "outputs", "fixed"),
+    [(STRIBECK, ["delta"], 4, 0), (ELASTO_PLASTIC, ["sigma_0", "rho"], 6, 1)],
+)
+def test_a_coefficient_that_is_not_fitted_stays_constant(law, constant, outputs, fixed) -> None:
+    schedule = NeuroFuzzy(law, 2)
     lower, upper = schedule.bounds()
-    fixed = lower == upper
-    # One output of five, of every rule's plane and of every unit, at both joints.
-    assert int(fixed.sum()) == 2 * (25 * 3 + 10)
-    assert torch.isinf(lower[~fixed]).all()
-    assert torch.isinf(upper[~fixed]).all()
-    schedule.set_parameter_vector(normal(len(lower)).clamp(lower, upper))
+    bound = lower == upper
+    # The planes of all rules and the units, at both joints; no output for the last coefficients.
+    assert len(lower) == outputs * 2 * (25 * 3 + 10)
+    assert int(bound.sum()) == fixed * 2 * (25 * 3 + 10)
+    assert torch.isinf(lower[~bound]).all()
+    assert torch.isinf(upper[~bound]).all()
+    schedule.set_parameter_vector(0.1 * normal(len(lower)).clamp(lower, upper))
     found = schedule(*motion(20, 2)[:2])
-    delta = STRIBECK.names.index("delta")
-    torch.testing.assert_close(found[..., delta], torch.full((20, 2), 2.0, dtype=torch.float64))
-    assert (found.std(0)[:, :delta] > 1e-3 * found.mean(0)[:, :delta]).all()
+    same = torch.tensor([name in constant for name in law.names])
+    torch.testing.assert_close(
+        found[..., same], schedule.reference_coefficients()[:, same].expand(20, -1, -1)
+    )
+    assert (found.std(0) > 1e-3 * found.mean(0))[:, ~same].all()
 
 
 def by_parameters(schedule: NeuroFuzzy, qd: Tensor, qdd: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ class Windows:
         with memory are those that balance the torques: the motion before would show them only where
         it is known to a fraction of the displacement over which contacts yield.
         """
-        motions = [[torch.as_tensor(x) for x in (m.qd, m.qdd)] for m in self.motions]
+        motions = [[torch.tensor(x) for x in (m.qd, m.qdd, m.time)] for m in self.motions]
         hidden = law_state = None
         if model.state_size:
             along = [model.schedule.states(*motion) for motion in motions]

@@ -29,6 +29,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.friction.inputs import is_heated
 from nfriction.optim.least_squares import LeastSquaresResult
 
 # Counts of a coarse encoder that is still in use.
@@ -180,7 +181,7 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     count; but it errs alike each time, which no average over samples takes out.
     """
     variables, x = problem.variables, result.x
-    if problem.friction.schedule.state_size:
+    if problem.friction.schedule.state_size and not is_heated(problem.friction.law):
         # Its memory advances with every step, and would run ahead in finer ones.
         return torch.zeros_like(x)
     lower, upper = variables.bounds()

@@ -1,9 +1,10 @@
 """Decision variables of a shooting problem: their order in one vector, bounds and priors."""
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,10 +13,9 @@ from nfriction.fitting.adjusted_plant import PlantParameter
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
-from nfriction.friction.heat import Heated
-from nfriction.friction.inputs import is_heated
 from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
+from nfriction.simulation.protocols import at_sample_time
 
 
 def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
@@ -26,12 +26,9 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 
 
 def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
-    """A copy of a friction model for simulations that count substeps as samples."""
-    copied = copy.deepcopy(model)
-    if is_heated(model.law):
-        schedule = cast("Heated", copied.schedule)
-        schedule.set_sample_time(schedule.sample_time / substeps)
-    return copied
+    """A friction model for simulations that count substeps as samples."""
+    sample_time = getattr(model.schedule, "sample_time", math.nan)
+    return at_sample_time(model, sample_time / substeps)
 
 
 def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:

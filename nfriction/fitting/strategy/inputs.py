@@ -86,7 +86,7 @@ def heated_schedule(
     schedule = HeatedConstant(law, len(initial), initial)
     step = float(np.median(np.concatenate([np.diff(motion.time) for motion in motions])))
     schedule.set_heat(1.0, cooling_time, step)
-    heat = [schedule.states(*map(torch.as_tensor, (m.qd, m.qdd))) for m in motions]
+    heat = [schedule.states(*map(torch.tensor, (m.qd, m.qdd, m.time))) for m in motions]
     # A joint without friction stays cold at any capacity.
     most = torch.cat(heat).amax((0, 2))
     schedule.set_heat(torch.where(most > 0, most, 1.0), cooling_time, step)

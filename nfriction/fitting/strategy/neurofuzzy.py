@@ -1,10 +1,10 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First its sets stay where they are, and windows held out choose the priors. Then it trains on at the
-noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
-evidence favours that; as long as the windows held out gain by it, at ever less noise. Further
-inputs (`inputs`) are a rival that has to win on the windows held out. Every window is held out in
-turn, and a gain has to be larger than its scatter over the windows explains.
+First the law takes further inputs (`inputs`) with which it errs less on windows held out. Then the
+network trains with its sets where they are, and windows held out choose the priors. It trains on at
+the noise that it left, with a prior for each group of parameters by evidence, and moves its sets if
+the evidence favours that; as long as the windows held out gain by it, at ever less noise. Every
+window is held out in turn, and a gain has to be larger than its scatter over the windows explains.
 """
 
 import copy
@@ -97,9 +97,9 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     try:
         if widened is None:
             raise StoppedError
-        contest.train()
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
+        contest.train()
     except StoppedError:
         contest.halt()
     if chosen:
@@ -123,10 +123,9 @@ def _without_inputs(task: FitTask) -> FitTask:
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
-    """The inputs that pay and the contest with them, or none and the one without.
+    """The inputs with which the law wins on the windows held out and the contest with them.
 
-    They have to win on the windows held out, first for the law and then for what is kept of its
-    network.
+    Or none, and the one without.
     """
     task = plain.task
     chosen = chosen_inputs(task, plain.start)
@@ -140,12 +139,9 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    chance = task.options.input_chance
-    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
+    if not gains(rival.validation.of_law, plain.validation.of_law, task.options.input_chance):
         return (), plain
     rival.train()
-    if not gains(rival.squares, plain.squares, chance):
-        return (), plain
     # Friction of the law alone may drive where that of its network does not.
     return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
@@ -184,12 +180,6 @@ class _Contest:
         return gains(trial.squares, self.validation.of_law)
 
     @property
-    def squares(self) -> Tensor:
-        """Squared errors of the network where it is accepted, else of the law, (window,)."""
-        assert self.best is not None
-        return self.best.squares if self.accepts(self.best) else self.validation.of_law
-
-    @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network where it is accepted."""
         assert self.best is not None
@@ -200,8 +190,9 @@ class _Contest:
         return replace(self.start, model=model, plant=plant)
 
     def train(self) -> None:
-        """Find the best network; raises `StoppedError`."""
-        self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
+        """Find the best network, once; raises `StoppedError`."""
+        if self.best is None:
+            self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
     def halt(self) -> None:
         """Keep the network as it is: the caller stopped what was to come."""

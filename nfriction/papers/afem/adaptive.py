@@ -188,7 +188,7 @@ class Adaptive(Tabulated):
         constant = bool((sets == sets[0]).all())
         return {"always": sets[0]} if constant else dict(zip(CLASSES, sets, strict=True))
 
-    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+    def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
         # As in the base class, but without a step of torch to every sample.
         first = torch.sqrt(qdd[:1] ** 2 + (self.swing_rate * qd[:1]) ** 2)
         size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)

@@ -146,7 +146,7 @@ class RBFCoefficients(Schedule):
         change = (jerk - state.select(-1, 1)) / self.step
         return torch.stack([smoothed, jerk, snap + self.gain * (change - snap)], -1)
 
-    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+    def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
         if not self.remembers:
             return self.initial_state(qd, qdd)
         # As in the base class, but without a step of torch to every sample.
