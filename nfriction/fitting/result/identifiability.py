@@ -1,7 +1,7 @@
 """Confidence intervals, unidentifiable parameters, warnings, and coefficients at any motion.
 
 Linear least-squares theory around the minimum, with two corrections: residuals are autocorrelated,
-so intervals use the effective sample size; parameters at a bound get no interval inside it.
+so intervals use the effective sample size; and intervals are clipped at the parameters' bounds.
 """
 
 import math
