@@ -428,7 +428,7 @@ def test_a_recording_of_another_rig_is_named():
         for name, x in files.items()
     ]
     found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
-    assert found == ("other is of another rig, or recorded in another way, than the others",)
+    assert found == ("other is from another rig than the others, or was recorded differently",)
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
 
 

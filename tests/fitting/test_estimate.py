@@ -319,8 +319,8 @@ def test_what_does_not_match_is_refused():
     other = swing(pendulum(), true_model(), seconds=0.5, convention="absolute,hanging", name="o")
     for arguments, message in (
         ((LFM(2), pendulum(), []), "at least one recording"),
-        ((LFM(3), pendulum(), recording), "as many joints"),
-        ((LFM(2), LinearAxis(1.0), recording), "as many joints"),
+        ((LFM(3), pendulum(), recording), "equally many joints"),
+        ((LFM(2), LinearAxis(1.0), recording), "equally many joints"),
         ((LFM(2), pendulum(), [recording, other]), "convention"),
         ((LFM(2), pendulum(), replace(recording, unit="m")), "swing is in m, .* in rad"),
         ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
@@ -626,5 +626,5 @@ def test_what_ends_at_zero_is_told_as_none_of_it():
     recording = swing(pendulum(), truth, seconds=3.0)
     found = fit(LFM(2, v_smooth=0.05), pendulum(), recording, windows=(0.5,), max_steps=10)
     assert {"B of joint1", "drag quadratic"} <= set(found.at_bounds)
-    assert f"At zero: {', '.join(found.at_bounds)}; the data show none." in found.warnings
+    assert f"At zero: {', '.join(found.at_bounds)}; the data show no such effect." in found.warnings
     assert not any("beyond" in w for w in found.warnings)

@@ -437,7 +437,7 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
     assert len(again) == 60
     assert recording[pd.Series(keep)].digest() == part.digest()
     for wrong in (keep[:50], np.arange(10), True):
-        with pytest.raises(TypeError, match=r"100 times True or False, got .* of shape"):
+        with pytest.raises(TypeError, match=r"mask of 100 booleans, got .* of shape"):
             recording[wrong]
 
 
@@ -646,7 +646,7 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
     path.write_text("id,q0_1,qd0_1\n")
-    with pytest.raises(ValueError, match="has no rows; write one with id, q0_1, qd0_1"):
+    with pytest.raises(ValueError, match="has no rows; write one per recording with id, q0_1, qd0_1"):
         read_initial_states(path)
     path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
     assert list(read_initial_states(path)) == ["a"]
@@ -738,7 +738,7 @@ def test_a_motor_unknown_to_the_rig_is_named() -> None:
 @pytest.mark.parametrize("size", [1.0, 20.0])
 def test_positions_in_whole_degrees_or_counts_are_refused(size):
     q, time = np.rint(np.linspace(0, 360 * size, 50))[:, None], np.arange(50) / 100
-    with pytest.raises(ValueError, match=r"radians, got whole numbers alone, from 0 to .*counts"):
+    with pytest.raises(ValueError, match=r"radians, got only whole numbers, from 0 to .*counts"):
         Recording(time, q)
     assert Recording(time, q, unit="m").unit == "m"
     assert Recording(time, np.ones_like(q)).joints == 1
