@@ -394,8 +394,8 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         raise ValueError(f"the friction torque of {name} is {tau[0]:g} in every row.")
     if float(tau @ qd) < 0.0:
         remarks.append(
-            f"The friction torque of {name} drives the joint on average, as with the wrong sign: it "
-            "must be positive with positive velocity. If the sign is wrong, reverse it."
+            f"The friction torque of {name} drives the joint on average, as with the wrong sign: "
+            "it must be positive with positive velocity. If the sign is wrong, reverse it."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
 

@@ -362,7 +362,7 @@ def test_motions_must_be_those_of_the_recordings(model):
                   for s, n in ((0.5, "one"), (0.6, "other")))  # fmt: skip
     motion = kalman_smoother(one.time, one.q)
     for recordings, motions in (([one, other], [motion]), ([other], [motion])):
-        with pytest.raises(ValueError, match=r"`motions` must be one of each recording.*got 1 of"):
+        with pytest.raises(ValueError, match=r"`motions` must match the recordings.*got 1 of"):
             fit(model(2), pendulum(), recordings, motions=motions)
 
 
