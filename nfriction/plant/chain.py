@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Zero in a new chain.
 _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
-# Least gravity [m/s^2], as loads are in units of a link's weight.
+# Smallest gravity [m/s^2], because loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
 
 
@@ -37,7 +37,7 @@ class Arm:
     length: float
 
     def __post_init__(self) -> None:
-        # Without length the chain swings unmoved by the arm, and the mass matrix may be singular.
+        # Without length the arm does not move the chain, and the mass matrix may be singular.
         for name in ("inertia", "length"):
             value = number(f"arm's {name}", getattr(self, name), positive=True)
             object.__setattr__(self, name, value)
@@ -46,14 +46,14 @@ class Arm:
 def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
     if gravity < WEIGHTLESS:
         raise ValueError(
-            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; give that to links "
-            "in a horizontal plane."
+            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; use this value for "
+            "links in a horizontal plane."
         )
     if not isinstance(arm, Arm | None):
         raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
     if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
         raise ValueError(
-            '`normal_load` must be "link" or, of a chain on a fixed pivot, "bearing", got '
+            '`normal_load` must be "link" or, for a chain on a fixed pivot, "bearing", got '
             f"{normal_load!r}."
         )
 
@@ -61,7 +61,7 @@ def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
 def _rotor_inertia(
     motor: Motor | None, armature: Sequence[float] | Tensor | None, joints: int
 ) -> Tensor:
-    """Rotor inertia seen at each joint, by the motors or given, (joints,)."""
+    """Rotor inertia seen at each joint, from the motors or as given, (joints,)."""
     rotor = (motor or Motor()).reflected_inertia(joints)
     if armature is not None:
         if rotor.any():
@@ -82,12 +82,12 @@ class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
-    is measured from upright, each further one relative to the link before. Air drag, gears and
+    is measured from upright, each further one relative to the previous link. Air drag, gears and
     eccentric encoders are part of a plant once `replace` sets them. With gears, methods take and
-    give the motors' torques, from which friction is subtracted at the motor side, as a controller
+    return the motors' torques, from which friction is subtracted on the motor side, as a controller
     commands it; tau above is their torque at the joints. With eccentric encoders, inputs and
-    outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over the
-    true angles at that reading.
+    outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` refer to the true
+    angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -100,8 +100,8 @@ class PendulumChain(Plant):
         arm: the rotating arm; None where it is fixed.
         armature: rotor inertia seen at each joint [kg m^2]; None for that of `motor`, if any.
         normal_load: `"link"` for |N|/(m g) of the joint's own link, as in the paper; `"bearing"`
-            for the whole force that the joint carries, of all links beyond it; see `load`.
-        motor: motors and gears of the joints; a rotor's inertia there is seen at its joint.
+            for the total force that the joint carries, from all links beyond it; see `load`.
+        motor: motors and gears of the joints, with the rotors' inertias.
         convention: of the recordings' columns, see `Plant`.
         joint_names, name, position_quantum: see `Plant`.
 

@@ -63,7 +63,7 @@ class Rotor(PendulumChain):
             )
         if not isinstance(motor, Motor | None):
             raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
-        # All inertia in one number, for none of its parts is identifiable beside the others.
+        # All inertia in one number, because its parts are not identifiable separately.
         rotor = 0.0 if motor is None else float(motor.reflected_inertia(1))
         if not inertia + rotor > 0:
             raise ValueError(
@@ -80,7 +80,7 @@ class Rotor(PendulumChain):
         self._given = {**given, "convention": list(self.convention)}
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """1 [-]: the load of the gear and bearings of a motor hardly depends on the pose."""
+        """1 [-], because the load of a motor's gear and bearings hardly depends on the pose."""
         self._check(q=q, qd=qd)
         return torch.ones_like(q)
 

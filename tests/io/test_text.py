@@ -151,10 +151,10 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time;q1;q2\n0,1;1,5;1.5\n0,2;1,6;1.6\n", "decimal commas and column q2 decimal points"),
         ("time;q1\n0,1;1,5\n0,2;1.6\n", "must be a number, got '1,5'|decimal commas"),
         ("time;q1\n0;1.23,5\n1;1.235,5\n", r"column q1, row 0 .* got '1\.23,5'"),
-        ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 is there more than once"),
-        ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 is there more than once"),
-        ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is no unit of q"),
-        ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is no unit of q"),
+        ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 occurs more than once"),
+        ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 occurs more than once"),
+        ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is not a unit of q"),
+        ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is not a unit of q"),
         ("time;q1\nx;y\n0;1\n", "row 0 .* must be a number, got 'x'"),
         ("# only: a comment\n", "no header"),
         ("time;q1\n0;\0\n", "NUL bytes"),
@@ -278,8 +278,8 @@ def test_signs_that_contradict_are_refused(tmp_path: Path, text: str, message: s
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"q1": "enc:grad"}, "enc:grad is missing.* 'grad' is no unit known"),
-        ({"q1": "enc:ms"}, "column enc: 'ms' is no unit of q"),
+        ({"q1": "enc:grad"}, "enc:grad is missing.* 'grad' is not a known unit"),
+        ({"q1": "enc:ms"}, "column enc: 'ms' is not a unit of q"),
         ({"q1": "absent:deg"}, "absent:deg is missing; found time, enc"),
         ({"q1": "enc:rad", "time": "time [ms]:s"}, "is missing"),
         ({"joint": "enc"}, "`columns` maps time, q1"),
@@ -307,7 +307,7 @@ def test_a_german_row_of_units_is_read_and_own_words_give_way(tmp_path: Path) ->
     np.testing.assert_allclose(found.time[:2], [0, 1e-3])
     np.testing.assert_allclose(np.rad2deg(found.q[1, 0]), 10.5)
     np.testing.assert_allclose(found.q[8, 1], 8e-3)
-    with pytest.raises(ValueError, match="'Striche' is no unit of q"):
+    with pytest.raises(ValueError, match="'Striche' is not a unit of q"):
         read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns | {"q2": "Arm"})
 
 

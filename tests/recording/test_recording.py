@@ -250,7 +250,7 @@ def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
 
 def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", time=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="none of numbers or text"):
+    with pytest.raises(ValueError, match="neither numbers nor text"):
         Recording.read(tmp_path / "run.npz")
 
 
@@ -318,7 +318,7 @@ def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
         assert np.array_equal(found.q[:, 0], q)
     assert list(numbered.columns) == [0, 1]
     repeated = pd.DataFrame(np.stack([time, q, q], axis=1), columns=["time", "q1", "q1"])
-    with pytest.raises(ValueError, match="column q1 is there more than once"):
+    with pytest.raises(ValueError, match="column q1 occurs more than once"):
         Recording.from_pandas(repeated)
 
 
@@ -723,11 +723,11 @@ def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
 
 
 def test_a_motor_unknown_to_the_rig_is_named() -> None:
-    with pytest.raises(ValueError, match=r"motor1 is of a motor.*`gear_ratio`.*plant=rig"):
+    with pytest.raises(ValueError, match=r"motor1 belongs to a motor.*`gear_ratio`.*plant=rig"):
         Recording.from_pandas(motor_log(motor1=1.0))
     table = motor_log(q1=0.1)
     rig = Rotor(0.02, motor=Motor(50))
-    with pytest.raises(ValueError, match=r"current1 is of a motor.*`torque_constant`"):
+    with pytest.raises(ValueError, match=r"current1 belongs to a motor.*`torque_constant`"):
         Recording.from_pandas(table, columns={"current1": "I"}, plant=rig)
     # A column that happens to be there is no reason to stop.
     with pytest.warns(RecordingWarning, match="looks like motor current"):
