@@ -1,4 +1,4 @@
-"""The C of a controller: templates filled with a model's tables and with its law, emitted."""
+"""C code of a controller: templates filled with a model's tables and its generated law."""
 
 import math
 import re
@@ -19,9 +19,9 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant
 
-# An exponential that compilers vectorise: that of `math.h` is a call for every number, this one a
-# loop over an array without branches or tables.
-# Of (exp(r) - 1) / r for |r| <= ln(2) / 2, minimax: exp(r) to 4e-18 and 2e-9, beside roundings.
+# An exponential that compilers vectorise: `math.h` needs a call for every number, this one is a
+# loop over an array without branches or tables. Minimax polynomial of (exp(r) - 1) / r for |r| <=
+# ln(2) / 2: exp(r) to 4e-18 and 2e-9, plus round-off.
 _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "double": (1.0, 0.5000000000000012, 0.16666666666666222, 0.0416666666665181,
                0.008333333333548278, 0.0013888888946297076, 0.0001984126943904723,
@@ -30,13 +30,13 @@ _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "float": (1.0, 0.49999994, 0.16666432, 0.041667998, 0.008374143, 0.0013843952),
 }  # fmt: skip
 
-# ln 2 as a number of few bits, whose products with whole numbers are exact, and the rest.
+# ln 2 as a number with few bits, whose products with whole numbers are exact, and the remainder.
 _LN2: dict[Real, tuple[float, float]] = {
     "double": (0.693145751953125, 1.4286068203094173e-06),
     "float": (0.693359375, -0.00021219444),
 }
 
-# Shift of a set that is there for its place alone: its membership is zero.
+# Shift of a padding set, whose membership is zero.
 _NOWHERE = 1e3
 
 
@@ -49,7 +49,7 @@ def source_of(
 ) -> tuple[str, str]:
     """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
 
-    With a plant, and a law that reads the load, they have a function of the plant's load.
+    With a plant and a law that reads the load, they contain a function for the plant's load.
     """
     if dialect.real == "float":
         controller = for_single_precision(controller)
@@ -64,7 +64,7 @@ def source_of(
         and any(_depends(x, "load") for x in _traced_law(controller.model, 1).outputs[0].nodes),
         "bits": description["status_bits"],
         "drive_torques": [] if plant is None else plant.torque_offset.tolist(),
-        # Names and units are foreign text.
+        # Names and units are untrusted text.
         "about": description,
         "safe": lambda text: comment(str(text)).rstrip(),
     }
@@ -84,7 +84,7 @@ def source_of(
 
 
 def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
-    """Words of the controller's template beside its sizes."""
+    """Words of the controller's template in addition to its sizes."""
     model: FrictionModel = controller.model
     # A subclass computes as it likes: only the class that names its form itself has that form.
     form = vars(type(model.schedule)).get("form", "traced")

@@ -439,7 +439,7 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
     assert task.per_recording
     assert not task.mistakes
     shared = prepare_task(CVFM(2), plant, recordings, FitOptions(encoder_reference="shared"))
-    assert "of another rig" in shared.mistakes[0]
+    assert "from another rig" in shared.mistakes[0]
 
 
 @pytest.mark.parametrize("rounded", [True, False])

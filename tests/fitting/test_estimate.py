@@ -326,7 +326,7 @@ def test_what_does_not_match_is_refused():
         ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
         (
             (LFM(2), pendulum(), [other, recording, replace(other, name="copy")]),
-            "3 .copy.; leave one",
+            "3 .copy. contain the same data; leave one",
         ),
     ):
         with pytest.raises(ValueError, match=message):

@@ -646,7 +646,9 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
     path.write_text("id,q0_1,qd0_1\n")
-    with pytest.raises(ValueError, match="has no rows; write one per recording with id, q0_1, qd0_1"):
+    with pytest.raises(
+        ValueError, match="has no rows; write one per recording with id, q0_1, qd0_1"
+    ):
         read_initial_states(path)
     path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
     assert list(read_initial_states(path)) == ["a"]

@@ -328,7 +328,7 @@ def test_a_memory_made_for_other_samples_is_warned_of(caplog):
 
 
 def test_a_memory_must_fit_the_model():
-    with pytest.raises(ValueError, match="leave it out"):
+    with pytest.raises(ValueError, match="omit it"):
         run(smooth_model(), steps=2, hidden_state=torch.zeros(2, 2))
     for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
         with pytest.raises(ValueError, match="hidden_state"):
