@@ -1,6 +1,6 @@
 """Rigs: published mechanisms by name, and a user's own from files.
 
-A rig file (JSON or TOML) holds the constructor arguments of `PendulumChain` (kind "chain", the
+A rig file (JSON or TOML) contains the constructor arguments of `PendulumChain` (kind "chain", the
 default), `Rotor` (kind "rotor") or `LinearAxis` (kind "axis"), in SI units:
 
     {"kind": "chain", "name": "bench", "mass": [0.26, 0.12], "length": [0.17, 0.23],
@@ -10,9 +10,9 @@ default), `Rotor` (kind "rotor") or `LinearAxis` (kind "axis"), in SI units:
      "motor": {"gear_ratio": 50, "rotor_inertia": 1.2e-5, "torque_constant": 0.03}}
 
 Angles of a chain without a `convention` are relative, from upright. `motor` may be given for every
-kind, with one number for all joints or one for each (`Motor`). `buffers` may hold values in place
-of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so.
-Robot descriptions (URDF, MJCF) are read, too.
+kind, with one number for all joints or one for each (`Motor`). `buffers` may contain values in
+place of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`, as in the file of a fitted
+plant. Robot descriptions (URDF, MJCF) can also be read.
 """
 
 import difflib
@@ -47,16 +47,16 @@ def tlrip(
     name: str = "tlrip",
     convention: Sequence[str] = ("relative", "upright"),
 ) -> PendulumChain:
-    """Triple link rotary inverted pendulum (Table 2); paper joints 2, 3, 4, with a free arm 1 too.
+    """Triple link rotary inverted pendulum (Table 2): paper joints 2 to 4, with a free arm 1 to 4.
 
-    Mass centres half way. The printed Izz are taken about the mass centres. The arm is a rod with
-    Izz1 about its own centre; its balance mass appears in no printed equation and is left out.
+    Mass centres are in the middle of links; the printed Izz are taken about them. The arm is a rod
+    with Izz1 about its own centre; its balance mass is left out, as in all printed equations.
 
     Args:
         arm: "fixed" (three joints) or "free" (four, the arm first).
         inertia: "none" (point masses), "izz" (slender links with the printed Izz) or a full
             tensor per link, (3, 6) as in `PendulumChain` [kg m^2].
-        name, convention: for a rig of the same numbers.
+        name, convention: for another rig with the same numbers.
 
     References:
         Comparative study of joint neuro-fuzzy friction models for a triple link rotary inverted
@@ -87,8 +87,9 @@ def tlrip(
 def rtip(arm: Literal["fixed", "free"] = "fixed", inertia: InertiaCase = "izz") -> PendulumChain:
     """Rotary triple inverted pendulum of the second paper.
 
-    Assumed: that paper prints no masses or lengths and describes the same pendulum, so the numbers
-    are Table 2 of the first. Known to differ: angles are measured from hanging.
+    That paper prints no masses or lengths and describes the same pendulum, so the numbers are
+    assumed to be those in Table 2 of the first paper. In contrast, angles are measured from
+    hanging.
 
     References:
         Comparison of friction estimation models for a rotary triple inverted pendulum.
