@@ -205,8 +205,8 @@ def text(workspace: Workspace) -> str:
     ]
     parts.append(
         "printed: the papers' numbers, from recordings that were never published, with the "
-        "friction of another\nmachine; ours: simulated twins. -papers: by the papers' own procedure "
-        "(fuzzy controller, 2-10-2 network),\n-pattern: by their pattern search."
+        "friction of another\nmachine; ours: simulated twins. -papers: by the papers' own "
+        "procedure (fuzzy controller, 2-10-2 network),\n-pattern: by their pattern search."
     )
     return "\n\n".join([*parts, f"how the fits ended\n{tables.fit_ends(workspace)}"])
 
