@@ -163,10 +163,9 @@ def _add_network(
 def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
     """Scales folded into slopes, shifts and weights.
 
-    Inputs are brought to [-1, 1] by `gain x + shift`; sets and units are those of such inputs, with
-    exponents -(slope x + shift)^2. The head's bias is part of the consequents, half the
-    coefficients' scale of all weights and of the reference; the units of the head see its inputs in
-    that scale.
+    Inputs are scaled to [-1, 1] by `gain x + shift`; sets and units refer to these, with exponents
+    -(slope x + shift)^2. The head's bias is included in the consequents, and half the coefficients'
+    scale in all weights and in the reference; the units of the head take its inputs in that scale.
 
     Returns:
         `rate` (joint,); `gain` and `shift` (joint, input); `set_slope` and `set_shift` (joint,
@@ -228,7 +227,7 @@ _DEEP = 40.0
 
 def _deepest(slope: Tensor, shift: Tensor) -> float:
     """Largest exponent (slope x + shift)^2 of the nearest set, over inputs of -1 to 1."""
-    # It lies at an end of the range, or where two sets are alike.
+    # It lies at an end of the range, or where two sets have equal membership.
     meetings = [
         (sign * shift[..., :, None] - shift[..., None, :])
         / (slope[..., None, :] - sign * slope[..., :, None])
@@ -285,7 +284,7 @@ def _law(
 
 
 def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
-    """True where the law of all joints is that of one, joint by joint."""
+    """True if the law of all joints is that of one joint, repeated."""
     generator = np.random.default_rng(0)
     points = {p.name: generator.uniform(0.1, 2.0, (8, joints, len(p.nodes))) for p in one.inputs}
     alone = evaluate(one.outputs[0].nodes, points)[0]
@@ -322,7 +321,7 @@ def _load(plant: Plant, dialect: ControllerC) -> str:
 
 
 def _schedule(controller: Controller, dialect: ControllerC) -> str:
-    """Functions of the coefficients of a schedule of whatever kind, written out for all joints."""
+    """Functions of the coefficients of any schedule, written out for all joints."""
     schedule, joints = controller.model.schedule, controller.joints
     motion = {"qd": _example(joints), "qdd": _example(joints)}
 
@@ -379,12 +378,12 @@ def _braces(lines: Sequence[str], indent: str) -> str:
 
 
 def _example(*size: int) -> Tensor:
-    # All different, so that nothing looks alike by chance.
+    # All different, so that nothing is equal by chance.
     return torch.linspace(0.5, 1.5, math.prod(size), dtype=torch.float64).reshape(size)
 
 
 def exponential(dialect: ControllerC, joints: int, signs: int) -> str:
-    """Write `nf_exp`, and `nf_tanh` where there are `signs` numbers a joint to take it of."""
+    """Write `nf_exp`, and `nf_tanh` if it is needed for `signs` numbers per joint."""
     return dialect.text(
         "exponential.c", joints=joints, signs=signs, ln2=_LN2[dialect.real],
         polynomial=_by_pairs(dialect), spare=lambda count: _spare(count, dialect),
@@ -392,16 +391,16 @@ def exponential(dialect: ControllerC, joints: int, signs: int) -> str:
 
 
 def _spare(count: int, dialect: ControllerC) -> str:
-    """Spell the numbers by which an array is longer, so that exponentials vectorise by four.
+    """The padding of an array that lets exponentials vectorise by four.
 
-    At -O2 gcc vectorises only where it knows that no numbers remain. Single precision is for
+    At -O2 gcc vectorises only if it knows that no numbers remain. Single precision is for
     microcontrollers, which have no vectors.
     """
     return f" + {-count % 4}" if dialect.real == "double" and count % 4 else ""
 
 
 def _by_pairs(dialect: ControllerC) -> str:
-    """The polynomial in r by pairs of terms, of s = r^2: half as long a chain as Horner's."""
+    """The polynomial in r by pairs of terms in s = r^2: half as long a chain as Horner's."""
     texts = [dialect.literal(x) for x in _POLYNOMIAL[dialect.real]]
     pairs = [
         f"({texts[i]} + r * {texts[i + 1]})" if i + 1 < len(texts) else texts[i]

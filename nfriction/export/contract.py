@@ -319,8 +319,8 @@ def contract_of(
         "filter": controller.filter_options,
         "status_bits": {"outside": OUTSIDE, "not_finite": NOT_FINITE, "saturated": SATURATED},
         "edges": {
-            "outside_input_ranges": f"coefficients {beyond}; the law goes on",
-            "not_finite": "NaN torque and coefficients of that joint; its state stays",
+            "outside_input_ranges": f"coefficients {beyond}; the law continues",
+            "not_finite": "NaN torque and coefficients of that joint; its state is unchanged",
         },
     }
     # Through JSON, so that tuples become lists, as for a reader.
@@ -348,13 +348,13 @@ def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tens
     single = copy.deepcopy(model).float()
     qd, qdd, load = (x.float().double() for x in draw_motion(controller, 20_000, seed=7))
     seen = controller.seen(qd, qdd)[:2]
-    # The same memory for both: a rounding must not put a sample into another class.
+    # The same memory for both, because rounding must not put a sample into another class.
     motion = (*seen, model.schedule.initial_state(*seen))
     exact = model.schedule.coefficients_from(*motion)
     try:
         rounded = single.schedule.coefficients_from(*(x.float() for x in motion))
         torque = single.torque(qd.float(), load.float(), rounded)
-    except RuntimeError:  # a schedule of one's own that computes in double alone
+    except RuntimeError:  # a user's schedule that supports only double precision
         return scales
     pairs = ((torque, model.torque(qd, load, exact), 1.0), (rounded, exact, COEFFICIENT_SLACK))
     for (name, scale), (found, expected, slack) in zip(scales.items(), pairs, strict=True):
@@ -364,10 +364,10 @@ def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tens
 
 
 def verify(run: Runner, contract: Contract) -> Parity:
-    """Run an artefact over the contract's test vectors.
+    """Run an artefact on the contract's test vectors.
 
-    `run` takes the inputs in their order, each a float64 tensor (vector, joint), and gives torque,
-    coefficients and status of all, in order from the initial state where there is one.
+    `run` takes the inputs in their order, each a float64 tensor (vector, joint), and returns
+    torque, coefficients and status of all, in order from the initial state if there is one.
     """
     found = run(*contract.inputs.values())
     return compare(tuple(contract.outputs.values()), found, contract.tolerance, contract.scales)
@@ -430,14 +430,14 @@ def write_verified(
 
 
 def _plain(values: Any) -> Any:
-    """Nested lists of numbers, with strings for those that JSON does not know."""
+    """Nested lists of numbers, with strings for those that JSON lacks."""
     if isinstance(values, list):
         return [_plain(value) for value in values]
     return values if math.isfinite(values) else str(values)
 
 
 def _tensor(name: str, given: Any) -> Tensor:
-    """A tensor of nested lists as `_plain` spells them."""
+    """A tensor from nested lists as written by `_plain`."""
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
     values = numbers(name, given, words=("nan", "inf", "-inf"))

@@ -95,7 +95,7 @@ Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 def as_bounds(
     x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Both bounds in the shape of `x0`; infinite where there is none.
+    """Both bounds in the shape of `x0`; infinite if there is none.
 
     Raises:
         ValueError: if a shape does not fit, or a lower bound exceeds the upper one.

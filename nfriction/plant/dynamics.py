@@ -216,7 +216,7 @@ def _mass_beyond(mass: Tensor) -> Tensor:
 
 
 def bearing_lever(mass: Tensor, length: Tensor, com: Tensor) -> Tensor:
-    """Reach [m] by which each link's turning accelerates what a joint carries, (joint, link)."""
+    """Lever [m] by which each link's rotation accelerates the load of a joint, (joint, link)."""
     carried = mass.flip(0).cumsum(0).flip(0)
     own = (static_moment(mass, length, com) / carried[:, None]).triu()
     return own + length.expand_as(own).tril(-1)
@@ -339,7 +339,7 @@ def square_moments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def joint_torque(tau: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
-    """Torque at the joints behind gears, gain (tau - loss |tau| sgn(qd)) [N m], (*batch, joint).
+    """Torque at the joints after gears, gain (tau - loss |tau| sgn(qd)) [N m], (*batch, joint).
 
     `tau` is the motors' torque with friction subtracted: less of it arrives if the motor drives the
     joint, more if the joint drives the motor.

@@ -101,7 +101,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         joint_names: default joint1, joint2, ...
 
     Raises:
-        ValueError: if the names are not one a joint.
+        ValueError: if there is not one name per joint.
     """
     fuzzy = model.schedule.fuzzy_rules()
     if fuzzy is None:
