@@ -154,7 +154,7 @@ def test_what_is_no_artefact_is_refused(
     files = files_of(artefacts[kind])
     with zipfile.ZipFile(packed(bad, files), "a") as archive:
         archive.writestr(f"archive/{[*files][-1].upper()}", b"other")
-    with pytest.raises(ExportError, match=rf"bad{kind}: holds .* twice"):
+    with pytest.raises(ExportError, match=rf"bad{kind} contains .* twice"):
         verify_artefact(bad, MODEL, INFO)
     packed(bad, files | {f"extra/{METADATA}": b"{}"})
     with pytest.raises(ContractError):

@@ -161,7 +161,7 @@ def test_what_unpacks_to_far_more_is_refused(
     savemat(tmp_path / "run.mat", {"time": np.zeros(10**6)}, do_compression=True)
     assert (tmp_path / "run.mat").stat().st_size < 20_000
     monkeypatch.setattr("nfriction.io.formats.LARGEST", 10**6)
-    with pytest.raises(ValueError, match="unpacked bytes, more than 1000000 are read"):
+    with pytest.raises(ValueError, match="unpacked bytes, more than the limit of 1000000"):
         Recording.read(tmp_path / "run.mat")
 
 

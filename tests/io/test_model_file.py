@@ -369,8 +369,14 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "too few names": (lambda c: c.update(joint_names=["a"]), "must be 2 texts"),
     "digest no text": (lambda c: c["training_data"].update(run=1), "map names to digests"),
     "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "not an array|got shape"),
-    "extra": (lambda c: c["state"].update(other=[1.0]), "missing or not the model's: .*other"),
-    "absent": (lambda c: c["state"].pop("schedule.raw"), "missing or not the model's: .*raw"),
+    "extra": (
+        lambda c: c["state"].update(other=[1.0]),
+        "missing or do not belong to the model: .*other",
+    ),
+    "absent": (
+        lambda c: c["state"].pop("schedule.raw"),
+        "missing or do not belong to the model: .*raw",
+    ),
     "law": (lambda c: c.update(law="viscous"), "`law` is 'viscous' in the file, 'linear' in"),
     "coefficients": (lambda c: c.update(coefficients=[1, 2]), "`coefficients` is"),
 }

@@ -130,7 +130,7 @@ def test_only_whole_lines_are_comments(tmp_path: Path, separator: str) -> None:
 
 def test_degrees_said_of_the_whole_file_are_converted_when_asked(tmp_path: Path) -> None:
     text = "# unit: deg\n" + written(",", False)
-    with pytest.raises(ValueError, match="got 'deg'; degrees are converted by"):
+    with pytest.raises(ValueError, match=r"got 'deg'; .*converts degrees"):
         read(tmp_path, text)
     back = read(tmp_path, text, degrees=True)
     assert back.unit == "rad"
@@ -213,7 +213,7 @@ def test_counts_are_whole(tmp_path: Path, separator: str, recwarn: pytest.Warnin
 def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separator: str) -> None:
     text = log([thousands(int(x), separator) for x in COUNTS])
     with pytest.warns(
-        RecordingWarning, match=r"q1 .*3[56].*assumed is that it is a decimal sign; .*# decimal"
+        RecordingWarning, match=r"q1 .*assumed that .*3[56].* is a decimal sign; .*# decimal"
     ):
         assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], COUNTS / 1000)
     for decimal, scale in ((separator, 1000), ({",": ".", ".": ","}[separator], 1)):
@@ -227,7 +227,7 @@ def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separ
 def test_a_motion_through_a_thousand_is_followed_and_said(tmp_path: Path, separator: str) -> None:
     counts = COUNTS - 34_900
     text = log([thousands(int(x), separator) for x in counts])
-    with pytest.warns(RecordingWarning, match="assumed is that it separates thousands"):
+    with pytest.warns(RecordingWarning, match=r"assumed that .* separates thousands"):
         assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], counts)
 
 
@@ -317,7 +317,7 @@ def test_what_unpacks_to_far_more_is_refused(
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(b"time,q1\n" + b"0,0\n" * 100_000))
     monkeypatch.setattr("nfriction.io.formats.LARGEST", 100_000)
-    with pytest.raises(ValueError, match="unpacked bytes, more than 100000 are read"):
+    with pytest.raises(ValueError, match="unpacked bytes, more than the limit of 100000"):
         Recording.read(path)
 
 

@@ -181,7 +181,9 @@ def test_a_unit_shows_what_drives_a_joint(tmp_path: Path, unit: str, kind: str) 
 def test_a_column_is_named_once(columns: dict[str, str]) -> None:
     table = swing().to_pandas().drop(columns="tau2", errors="ignore")
     columns = {"q1": "q1", "q2": "q2"} | columns
-    with pytest.raises(ValueError, match=r"names column q\d for q\d and .*; each has a column"):
+    with pytest.raises(
+        ValueError, match=r"names column q\d for q\d and .*; each needs its own column"
+    ):
         Recording.from_pandas(table, columns=columns)
 
 

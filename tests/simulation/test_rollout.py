@@ -546,7 +546,7 @@ def test_inference_mode_changes_nothing(backend, scheme):
         ({"steps": 5, "drive": "measured"}, "measured"),
         ({"steps": 5, "drive": "mesured"}, "measured"),
         ({"steps": 5, "measured": (torch.zeros(5, 2),) * 2}, "measured"),
-        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(6, 2),) * 2}, "a step"),
+        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(6, 2),) * 2}, "one per step"),
         ({"steps": 5, "drive": "measured", "measured": (torch.full((5, 2), torch.nan),) * 2},
          "finite"),
         ({"steps": 5, "backend": "fortran"}, "backend"),

@@ -302,7 +302,7 @@ def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> lis
     if not used:
         return []
     role = "is a decimal sign" if table.attrs["decimal"] == sign else "separates thousands"
-    finding = f"{sign!r} in {cell!r} of column {column} is ambiguous; it is assumed that it {role}"
+    finding = f"column {column} is ambiguous: it is assumed that {sign!r} in {cell!r} {role}"
     remedy = "state the decimal sign with a line `# decimal: ,` or `# decimal: .` above the header"
     return [(finding, remedy)]
 
