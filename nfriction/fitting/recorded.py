@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 FEWEST_PERIODS = 10
 # Spacing of spatial frequencies, relative to one more period in the range of the motion.
 SPACING = 1 / 6
-# Smallest relative torque to which the law may be scaled.
+# Lower bound of the rules' factor on the law when a torque is divided by it.
 LEAST = 0.1
 # Number of trial shifts of a ripple's phase over a period.
 SHIFTS = 24
