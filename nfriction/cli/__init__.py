@@ -1,7 +1,7 @@
 """Command line: fit, compare, inspect and export friction models.
 
-Functions `add...(commands)` register commands. Only what runs them imports what is slow to load
-(torch, pandas, matplotlib), so that help and usage errors come at once.
+Functions `add...(commands)` register commands. Slow imports (torch, pandas, matplotlib) happen only
+when a command runs, so that help and usage errors appear at once.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from nfriction.cli.console import (
 )
 from nfriction.version import __version__
 
-# They register the commands, in the order in which the help lists them.
+# Functions that register the commands, in the order of the help.
 COMMANDS = (
     estimate.add_fit, estimate.add_compare, torque.add_fit, torque.add_score, demo.add_demo,
     inspect.add_report, inspect.add_info, export.add_export, export.add_verify, inspect.add_data,
@@ -35,18 +35,18 @@ COMMANDS = (
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
-    Errors are one line on standard error and exit status 2, an interrupt gives status 130, and
-    141 says that the reader of the output closed it.
+    An error prints one line on standard error and gives exit status 2, an interrupt gives 130, and
+    a closed output pipe 141.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        # Names of files and recordings may be no valid Unicode.
+        # Names of files and recordings may not be valid Unicode.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             return _answer(words)
         finally:
-            sys.stdout.flush()  # buffered output would fail too late to be caught
+            sys.stdout.flush()  # otherwise buffered output fails too late to be caught
     except BrokenPipeError:
         return drop_output()
 
@@ -91,14 +91,14 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Run a command whose arguments are sound."""
+    """Run a command whose arguments are valid."""
     import torch
 
     from nfriction.codegen import CodegenError
     from nfriction.export import ExportError
 
     console = logging.StreamHandler()
-    console.setLevel(logging.WARNING)  # a log file may hold more
+    console.setLevel(logging.WARNING)  # a log file may contain more
     console.addFilter(FirstOfItsKind())
     logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", handlers=[console])
     # Several threads make small tensors up to 100 times slower.
@@ -106,6 +106,6 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         with interruptible(), one_line_warnings():
             return arguments.run(arguments)
-    # Algebra on hopeless data fails in torch's own terms.
+    # Linear algebra on unusable data raises torch's own errors.
     except (CodegenError, ExportError, ArithmeticError, torch.linalg.LinAlgError) as error:
         raise UsageError(str(error)) from error

@@ -1,4 +1,4 @@
-"""The console: errors and warnings in a line, progress, Ctrl-C."""
+"""The console: errors and warnings on one line, progress, Ctrl-C."""
 
 import argparse
 import logging
@@ -19,20 +19,20 @@ from typing import Any, NoReturn
 
 
 class UsageError(Exception):
-    """The request cannot be met; the message says why and what to do."""
+    """The request cannot be met; the message states the reason and a remedy."""
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Shows defaults where there is one; leaves examples as they are written."""
+    """Shows defaults that exist; keeps the layout of examples."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
-        # "(default: None)" would say nothing, and some helps say it in words.
+        # "(default: None)" says nothing, and some help texts state the default in words.
         if action.default in (None, False, []) or "(default: " in (action.help or ""):
             return action.help
         return super()._get_help_string(action)
 
     def _split_lines(self, text: str, width: int) -> list[str]:
-        # Names with hyphens stay whole, to be copied.
+        # Names with hyphens are not split, so that they can be copied.
         return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
 
 
@@ -56,7 +56,7 @@ class Commands:
         self, name: str, run: Callable[[argparse.Namespace], int], help: str, *,
         description: str, example: str,
     ) -> Parser:  # fmt: skip
-        """Register a command, whose `run` returns the exit status, and give its parser."""
+        """Register a command, whose `run` returns the exit status, and return its parser."""
         parser: Parser = self._parsers.add_parser(
             name, help=help, description=description, epilog=f"example:\n  {example}"
         )
@@ -71,12 +71,12 @@ def check_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"cannot make the folder {folder}: there is a file in its way.") from None
-    # Permissions alone do not show it: the disk may be full or read-only.
+    # Permissions alone do not show whether writing works: the disk may be full or read-only.
     with tempfile.TemporaryFile(dir=folder):
         pass
 
 
-# The library advises its caller in Python; who types a command has options instead.
+# The library's messages advise Python callers; these patterns turn the advice into options.
 _OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
     (re.compile(r'columns=\{"(\w+)": "\.\.\."\}'), r"--columns \1=NAME"),
     (
@@ -94,7 +94,7 @@ _OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ..
 
 
 def one_line(message: object) -> str:
-    """A message of the library in one line, its advice in options of the command line."""
+    """A message of the library on one line, its advice given as command-line options."""
     text = " ".join(str(message).split())
     for argument, option in _OPTIONS:
         text = argument.sub(option, text)
@@ -102,26 +102,26 @@ def one_line(message: object) -> str:
 
 
 def message_of(error: Exception) -> str:
-    """An error in one line."""
+    """An error on one line."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return one_line(error)
 
 
 def warn(message: str) -> None:
-    """Tell the user what may be wrong, on standard error."""
+    """Print a warning on standard error."""
     print(f"nfriction: warning: {message}", file=sys.stderr)
 
 
 def drop_output() -> int:
-    """End quietly where the reader of the output is gone: the status of a closed pipe."""
-    # Python flushes once more on its way out.
+    """Suppress further output after the reader closed it; return the status of a closed pipe."""
+    # Python flushes once more at exit.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 128 + 13  # SIGPIPE, which not every system has
 
 
 class FirstOfItsKind(logging.Filter):
-    """Passes a message once: thousands of simulations of a search may diverge."""
+    """Passes a message once, because thousands of simulations in a search may diverge."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -152,9 +152,9 @@ _interrupted = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Remember a Ctrl-C: solvers keep their best point, but a user wants an end.
+    """Remember a Ctrl-C, because solvers catch it to return their best point.
 
-    The run ends where it next reports its progress.
+    The run ends at its next progress report.
     """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
@@ -172,14 +172,14 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-# Between two lines about the progress in a file [s].
+# Time between two lines of progress in a log [s].
 _QUIET = 10.0
 
 
 class Progress:
-    """The stages of a whole run, which are also logged, with the time taken and left.
+    """Progress through the stages of a run, also logged, with elapsed and remaining time.
 
-    On a terminal a bar; otherwise, as in a job's log, a line every ten seconds at most.
+    On a terminal it is a bar; otherwise, as in a job's log, at most one line every ten seconds.
     """
 
     def __init__(self, logger: logging.Logger | None = None) -> None:
@@ -196,7 +196,7 @@ class Progress:
 
     def __exit__(self, _type: object, error: BaseException | None, _trace: object) -> None:
         self._bar.close()
-        # The message that the user sees; only here the stage is known.
+        # The message that the user sees; the stage is known only here.
         if isinstance(error, KeyboardInterrupt):
             error.args = (f"({self._what}); no file was left half-written",)
 
@@ -209,13 +209,13 @@ class Progress:
         self._show(what)
 
     def expect(self, stages: int, *, brief: bool = False) -> None:
-        """So many further stages are to come; brief ones after all others."""
+        """Announce further stages; brief ones come after all others."""
         self._expected += stages
         self._long += 0 if brief else stages
         self._bar.total = self._expected
 
     def done(self) -> None:
-        """A stage has ended."""
+        """End a stage."""
         self._ended += 1
         self._last_end = time.monotonic()
         self._bar.update()
@@ -239,7 +239,7 @@ class Progress:
         return f"{self._ended + 1} of {self._expected}: " if self._expected else ""
 
     def _times(self, passed: float) -> str:
-        """Time passed, and time left by the mean of the long stages that have ended."""
+        """Elapsed time, and remaining time estimated from the mean of the finished long stages."""
         text = f"{passed:.0f} s"
         ended = self._last_end - self._begun
         # No estimate once the running stage alone has taken longer.

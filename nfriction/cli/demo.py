@@ -9,11 +9,11 @@ from nfriction.cli.console import Commands, check_writable
 from nfriction.cli.estimate import add_comparison_options, compare_and_report
 from nfriction.cli.inputs import count, positive
 
-# Held equal to the twins' own by a test; the twins themselves load torch.
+# Copies of the twins' values, kept equal by a test, because importing the twins loads torch.
 DURATION, TWIN_DURATION = 10.0, 20.0
 TRUTHS = ("load", "direction", "shear", "warming", "bristle", "ripple", "lag")
 
-# Three steps that a stranger can follow; others are fitted in the same way.
+# Three models, each of which extends the previous one; others are fitted in the same way.
 MODELS = "viscous,coulomb-viscous,neuro-fuzzy:coulomb-viscous"
 
 
@@ -21,11 +21,11 @@ def add_demo(commands: Commands) -> None:
     """Register `demo`."""
     parser = commands.add(
         "demo", run_demo, "simulate a rig with hidden friction, then compare models",
-        description="Simulate a triple pendulum (the papers' rig) with friction unknown to every "
-        "model, then compare models on recordings as its encoders would give them.",
+        description="Simulate a triple pendulum (the papers' rig) with friction that no model can "
+        "express exactly, then compare models on recordings by simulated encoders.",
         example="nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo",
     )  # fmt: skip
-    parser.add_argument("--seed", type=count, default=0, help="of encoder errors and jitter")
+    parser.add_argument("--seed", type=count, default=0, help="seed of encoder errors and jitter")
     parser.add_argument("--seconds", type=positive, default=DURATION,
                         help="length of each recording [s]")  # fmt: skip
     add_comparison_options(parser)
@@ -44,9 +44,9 @@ def run_demo(arguments: argparse.Namespace) -> int:
     )
     plant, train, test = simulated.plant, simulated.part("train"), simulated.part("test")
     print(
-        "simulated a triple pendulum, as its encoders would record it, with friction unknown to "
-        f"every model:\n{len(train)} recordings of {arguments.seconds:g} s to train on, "
-        f"{len(test)} to test on"
+        "simulated a triple pendulum, recorded by encoders, with friction that no model can "
+        f"express exactly:\n{len(train)} recordings of {arguments.seconds:g} s for training, "
+        f"{len(test)} for testing"
     )
     return compare_and_report(plant, train, test, arguments, {"fit_plant": False})
 
@@ -54,16 +54,16 @@ def run_demo(arguments: argparse.Namespace) -> int:
 def add_twin(commands: Commands) -> None:
     """Register `twin`."""
     parser = commands.add(
-        "twin", run_twin, "simulate recordings of a rig whose friction a seed draws",
-        description="Write recordings of a simulated triple pendulum: two to train on, ten to "
-        "judge by, the rig and a card with the true friction.",
+        "twin", run_twin, "simulate recordings of a rig with randomly drawn friction",
+        description="Write recordings of a simulated triple pendulum: two for training, ten for "
+        "testing, with the rig and a card that describes the true friction.",
         example="nfriction twin --truth load+warming --seed 1 --out runs/twin",
     )  # fmt: skip
     parser.add_argument("--truth", default="load", metavar="NAME",
-                        help=f"of {', '.join(TRUTHS)}, several with + between them, or plain: dry "
-                        "and viscous friction alone")  # fmt: skip
+                        help=f"effects in the true friction, joined by +: {', '.join(TRUTHS)}; or "
+                        "plain for dry and viscous friction alone")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
-                        help="of releases, friction, encoder errors and jitter")  # fmt: skip
+                        help="seed of releases, friction, encoder errors and jitter")  # fmt: skip
     parser.add_argument("--seconds", type=positive, default=TWIN_DURATION,
                         help="length of each recording [s]")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/twin"), help="folder to write")
@@ -84,8 +84,8 @@ def run_twin(arguments: argparse.Namespace) -> int:
     )
     train, test = simulated.part("train"), simulated.part("test")
     print(
-        f"{simulated.name}: {len(train)} recordings of {arguments.seconds:g} s to train on, "
-        f"{len(test)} to judge by, and the card README.md are in {arguments.out}"
+        f"{simulated.name}: {len(train)} recordings of {arguments.seconds:g} s for training, "
+        f"{len(test)} for testing, and the card README.md are in {arguments.out}"
     )
     folder = shlex.quote(str(arguments.out))
     print(
@@ -100,7 +100,7 @@ def add_reproduce(commands: Commands) -> None:
     parser = commands.add(
         "reproduce", run_reproduce, "reproduce the papers' tables and figures on simulated twins",
         description="Simulate the rigs of both papers with friction unknown to every model, train "
-        "all their models, and set tables and figures beside the printed ones.",
+        "all their models, and compare tables and figures with the printed ones.",
         example="nfriction reproduce --quick --out runs/papers\n\nAn interrupted run resumes where "
         "it left off when it is started again with the same options.",
     )  # fmt: skip
@@ -109,8 +109,8 @@ def add_reproduce(commands: Commands) -> None:
                         help="recordings of 10 s and shorter searches: a few minutes on two "
                         "cores")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
-                        help="of the encoders' errors and of the searches")  # fmt: skip
-    parser.add_argument("--jobs", type=count, default=2, help="models trained at a time")
+                        help="seed of the encoders' errors and of the searches")  # fmt: skip
+    parser.add_argument("--jobs", type=count, default=2, help="models trained in parallel")
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")
 
 
@@ -126,7 +126,7 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
     check_writable(arguments.out)
     settings = replace(QUICK if arguments.quick else FULL, seed=arguments.seed)
     progress = sys.stderr.isatty()
-    # Two runs in one folder would take each other's stages for their own.
+    # Two runs in one folder would mistake each other's stages for their own.
     with exclusive(arguments.out):
         workspace = reproduce(arguments.out, settings, jobs=arguments.jobs, progress=progress)
         page.write_tables(workspace, command=arguments.command_line)

@@ -1,4 +1,4 @@
-"""`nfriction fit` and `nfriction compare`: fit models to recordings, write and print what comes."""
+"""`nfriction fit` and `nfriction compare`: fit models to recordings, write and print results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def add_fit(commands: Commands) -> None:
         "--out lfm.json",
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
-                        help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
+                        help=f"file with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
     parser.add_argument("--model", type=inputs.model, default="neuro-fuzzy:load-coulomb",
                         help=f"{inputs.MODELS}; or my.py:LAW, a law of your own")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
@@ -52,7 +52,7 @@ def add_compare(commands: Commands) -> None:
     parser.add_argument("train", nargs="+", type=inputs.file, metavar="TRAIN", help="recordings to "
                         f"fit, with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
     parser.add_argument("--test", nargs="+", type=inputs.file, default=[], metavar="TEST",
-                        help="recordings to judge by, which no fit sees")  # fmt: skip
+                        help="recordings for testing, which no fit sees")  # fmt: skip
     add_comparison_options(parser)
     inputs.add_fit_options(parser)
 
@@ -61,7 +61,7 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
     add = parser.add_argument
     add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
-        help=f"with commas between them: {inputs.MODELS}; or my.py:LAW, a law of your own"
+        help=f"comma-separated: {inputs.MODELS}; or my.py:LAW, a law of your own"
         )  # fmt: skip
     add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     add("--initial-states", type=inputs.file, metavar="FILE",
@@ -71,11 +71,11 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
         "alone, by cross-validation over blocks of time")  # fmt: skip
     add("--no-figures", action="store_true", help="draw no figures")
     add("--also", choices=("svg", "pdf", "gif"), action="append", default=[], metavar="FORMAT",
-        help="write figures as svg or pdf, too, for a paper, or test recordings as animations "
-        "(gif); can be given several times")  # fmt: skip
+        help="also write figures as svg or pdf, or animations of the test recordings as gif; can "
+        "be repeated")  # fmt: skip
     add("--jobs", type=inputs.jobs, default=1, metavar="N",
-        help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
-        "joblib; the results are the same)")  # fmt: skip
+        help="number of parallel fits, each in its own process; -1 for one per core (needs joblib; "
+        "the results are the same)")  # fmt: skip
     add("--log-file", type=Path, metavar="FILE",
         help="append a log of stages, times and results")  # fmt: skip
 
@@ -90,7 +90,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     plant = inputs.read_rig(arguments.rig)
     recordings = inputs.read_recordings(arguments.recordings, plant, arguments)
     if arguments.out.is_dir():
-        raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
+        raise UsageError(f"--out of fit must be a file, but {arguments.out} is a folder.")
     check_writable(arguments.out.parent)
     with Progress() as progress:
         progress.stage(f"fit {arguments.model}")
@@ -140,14 +140,14 @@ def compare_and_report(
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
-    """Fit, score, write and print; the status is 1 where a model could not be fitted."""
+    """Fit, score, write and print; the status is 1 if a model could not be fitted."""
     from nfriction.cli.tables import verdict
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
     from nfriction.evaluation.results import exclusive, report_of, write_results
     from nfriction.report import write_report
 
-    check_recordings(train, test)  # before a choice that takes long
+    check_recordings(train, test)  # before a selection that takes long
     states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
     selection = None
@@ -168,7 +168,7 @@ def compare_and_report(
             formats=arguments.also,
         )  # fmt: skip
         if page is not None:
-            write_report(arguments.out, page)  # else the earlier run's page would be missed
+            write_report(arguments.out, page)  # replaces the page of an earlier run
         logger.info(verdict(comparison))
     _print(comparison, selection, plant, train, arguments)
     return 1 if comparison.failed else 0
@@ -185,7 +185,7 @@ def _print(
     from nfriction.evaluation.results import model_info
 
     print(f"\n{tables.error_tables(comparison)}")
-    # Tables show abbreviations, which a reader of plain names has not met.
+    # Tables show abbreviations, which a user of plain names may not know.
     names = (*comparison.fits, *comparison.failed)
     print(f"models: {', '.join(f'{name}: {plain_name(name)}' for name in names)}\n")
     for name, fit in comparison.fits.items():
@@ -213,7 +213,7 @@ def _print(
 
 
 def _conclusion(comparison: Comparison) -> str:
-    """The gain by the best model in a sentence; empty where none is better, or it is unusable."""
+    """The best model's gain in a sentence; empty if none is better, or the best is unusable."""
     from nfriction.evaluation.compare import NO_FRICTION
 
     best = comparison.best() or NO_FRICTION
@@ -235,7 +235,7 @@ def _conclusion(comparison: Comparison) -> str:
 
 @contextmanager
 def _log(path: Path | None) -> Iterator[logging.Logger]:
-    """The command's logger, which with all others of the package writes into a file."""
+    """The command's logger; it and all others of the package write into a file."""
     package = logging.getLogger("nfriction")
     if path is None:
         yield package
@@ -256,7 +256,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
 def _initial_states(
     arguments: argparse.Namespace, plant: Plant, recordings: Sequence[Recording]
 ) -> InitialStates | None:
-    """States of these recordings; warns of those that have none."""
+    """Initial states of these recordings; warns of recordings that have none."""
     from nfriction.recording import read_initial_states
 
     path = arguments.initial_states
@@ -270,5 +270,5 @@ def _initial_states(
                              f"the rig {plant.joints}.")  # fmt: skip
     without = [name for name in of if name not in states]
     if without:
-        warn(f"{path} has no state of {', '.join(without)}; estimated from the recording instead.")
+        warn(f"{path} has no state of {', '.join(without)}; it is estimated from the recording.")
     return states

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
 
-# Ending of the file that each target is written to; C is a folder of files.
+# File suffix of each target; C is a folder of files.
 CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
 SIMULATORS = {"mjcf": ".xml", "urdf": ".urdf"}
 TARGETS = (*CONTROLLERS, *SIMULATORS)
-# What computes in single precision where asked to; the others are in double at any rate.
+# Targets that can compute in single precision; the others always use double.
 IN_SINGLE = ("c", "onnx")
 
 
@@ -23,36 +23,36 @@ def add_export(commands: Commands) -> None:
     """Register `export`."""
     parser = commands.add(
         "export", run_export, "write artefacts for controllers and simulators",
-        description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
-        "the nearest joint parameters of a simulator.",
+        description="Write a fitted model as artefacts for controllers, each verified against the "
+        "model, or as the closest joint parameters of a simulator.",
         example="nfriction export model.json --format torchscript,c --out artefacts",
     )  # fmt: skip
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
-                        help=f"with commas between them: {', '.join(TARGETS)}")  # fmt: skip
+                        help=f"comma-separated: {', '.join(TARGETS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
     parser.add_argument("--name", type=_identifier, metavar="NAME",
-                        help="of the files, and in C prefix of all functions (default: that of "
+                        help="name of the files, and prefix of all C functions (default: that of "
                         "the model file)")  # fmt: skip
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
                         help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
     parser.add_argument("--torque-limit", type=inputs.positives, metavar="LIMIT,...",
-                        help="largest torque given out, one number or one a joint")  # fmt: skip
+                        help="limit of the output torque, one number or one per joint")  # fmt: skip
     parser.add_argument("--with-filter", action="store_true",
-                        help="take raw positions, with the causal filter inside")  # fmt: skip
+                        help="let the artefact take raw positions and filter them")  # fmt: skip
     parser.add_argument("--cutoff", type=inputs.positive, default=20.0, metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
     parser.add_argument("--online", type=inputs.positive, metavar="NOISE",
-                        help="C of a model with the papers' network that also learns while it "
-                        "runs, from a friction torque measured to this [N m]")  # fmt: skip
+                        help="C of a model with the papers' network that keeps learning while it "
+                        "runs, from friction torque measured with this noise [N m]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
     group.add_argument("--recording", type=inputs.file, action="append", default=[],
-                       help="motion along which the nearest parameters are sought; can be given "
-                       "several times")  # fmt: skip
+                       help="motion along which the closest parameters are fitted; can be "
+                       "repeated")  # fmt: skip
     group.add_argument("--rig", type=inputs.rig,
                        help="rig file or name (default: the one in the model file)")  # fmt: skip
     group.add_argument("--patch", type=inputs.file, metavar="ROBOT",
-                       help="robot description whose joints of these names get them")  # fmt: skip
+                       help="robot description to copy with these parameters")  # fmt: skip
     inputs.add_reading_options(group)
     inputs.add_law_option(parser)
 
@@ -60,16 +60,16 @@ def add_export(commands: Commands) -> None:
 def add_verify(commands: Commands) -> None:
     """Register `verify`."""
     parser = commands.add(
-        "verify", run_verify, "prove that an artefact is its model",
-        description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
-        "over its test vectors and over many points beside the model. Exit status 1 if they "
-        "differ. C is compiled and run as it is: verify only files that you trust.",
+        "verify", run_verify, "check that an artefact matches its model",
+        description="Compare an artefact (.pt, .pt2, .onnx, or .c with its .contract.json in the "
+        "same folder) with the model on its test vectors and at many random points. Exit status 1 "
+        "if they differ. C is compiled and run as it is: verify only files that you trust.",
         example="nfriction verify artefacts/model.pt model.json",
     )  # fmt: skip
-    parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
+    parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="file that export wrote")
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
-                        help="points to draw, to 10 %% beyond the range")  # fmt: skip
+                        help="random points, up to 10 %% beyond the trained range")  # fmt: skip
     inputs.add_law_option(parser)
 
 
@@ -81,7 +81,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     if wanted and not arguments.recording:
         raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
     if arguments.patch and len(wanted) != 1:
-        raise UsageError("--patch takes one of mjcf and urdf in --format.")
+        raise UsageError("--patch needs exactly one of mjcf and urdf in --format.")
     if arguments.online and "c" not in arguments.format:
         raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
@@ -104,7 +104,7 @@ def _write_controller(
 
     limit = arguments.torque_limit
     options: dict[str, Any] = {
-        # One number is for all joints.
+        # A single number applies to all joints.
         "torque_limit": limit[0] if limit and len(limit) == 1 else limit,
         "with_filter": arguments.with_filter,
         "cutoff_hz": arguments.cutoff,
@@ -128,9 +128,9 @@ def _write_controller(
 
 
 def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
-    """Run exported C on this machine and compare it with the model; where that cannot be, say so.
+    """Run exported C on this machine and compare it with the model, or print why that failed.
 
-    The other targets are compared as they are written.
+    The other targets are compared when they are written.
     """
     from nfriction import export
 
@@ -157,7 +157,7 @@ def _write_simulator(
     elif info.rig is not None:
         plant = rigs.from_dict(info.rig)
     else:
-        raise UsageError("the model file has no rig; give --rig, whose loads friction needs.")
+        raise UsageError("the model file has no rig; give --rig, because friction needs its loads.")
     model.check_loads(plant)
     recordings = inputs.read_recordings(arguments.recording, plant, arguments)
     moved = (recording.joint_coordinates(plant) for recording in recordings)
@@ -169,7 +169,7 @@ def _write_simulator(
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
-    """Compare, print a table, tell the verdict by the exit status."""
+    """Compare, print a table and return the verdict as exit status."""
     from nfriction.export import verify_artefact
     from nfriction.io.model_file import load, load_info
 
@@ -194,7 +194,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def _targets(text: str) -> list[str]:
-    """Names of targets with commas between them, for argparse."""
+    """Comma-separated names of targets, for argparse."""
     targets = [name.strip() for name in text.split(",") if name.strip()]
     for target in targets:
         if target not in TARGETS:
@@ -202,16 +202,16 @@ def _targets(text: str) -> list[str]:
                 f"cannot export to {target!r}; there are {', '.join(TARGETS)}"
             )
     if not targets:
-        raise argparse.ArgumentTypeError(f"takes some of {', '.join(TARGETS)}, got none")
+        raise argparse.ArgumentTypeError(f"needs some of {', '.join(TARGETS)}, got none")
     return targets
 
 
 def _identifier(text: str) -> str:
-    """A name that C takes, for argparse."""
+    """A valid C identifier, for argparse."""
     from nfriction.export.c_dialect import is_identifier
 
     if not is_identifier(text):
         raise argparse.ArgumentTypeError(
-            f"must be letters, digits and _ with a letter first and no word of C, got {text!r}"
+            f"must be letters, digits and _, begin with a letter and be no C keyword, got {text!r}"
         )
     return text

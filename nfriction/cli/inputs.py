@@ -1,6 +1,6 @@
-"""Names, numbers and files that options take, and the options of fits.
+"""Parsers for the values of options, and the options of fits.
 
-Importing it needs no torch; a test holds `RIGS` equal to `rigs.names()`.
+Importing this module does not import torch; a test keeps `RIGS` equal to `rigs.names()`.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ RIGS = (
 )  # fmt: skip
 MODELS = model_list()
 FORMATS = (
-    "CSV, TSV or TXT, Parquet, NumPy .npz, MATLAB .mat, HDF5 .h5, or MDF4 .mf4 as of ASAM loggers"
+    "CSV, TSV or TXT, Parquet, NumPy .npz, MATLAB .mat, HDF5 .h5, or MDF4 .mf4 from ASAM loggers"
 )
 RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
 DEFAULT_MODELS = "viscous,load-coulomb,arctan,stribeck,neuro-fuzzy:load-coulomb"
-# Of `nfriction.fit`; where an option is not given, its own default.
+# Options of `nfriction.fit`, whose defaults apply where an option is not given.
 _FIT_OPTIONS = (
     "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "max_steps",
     "loss", "fit_delay",
 )  # fmt: skip
 
 
-# `my.py:LAW`, alone or behind the kind of its coefficients.
+# `my.py:LAW`, alone or after the kind of its coefficients.
 _OWN_LAW = re.compile(r"(?P<kind>neuro-fuzzy:|adaptive:|)(?P<file>.+\.py):(?P<law>\w+)")
 
 
 def model(text: str) -> str:
-    """The name of a friction model, by either of its names, or FILE.py:LAW, for argparse."""
+    """The name of a friction model, plain or abbreviated, or FILE.py:LAW, for argparse."""
     own = _OWN_LAW.fullmatch(text.strip())
     try:
         return model_name(text if own is None else own["kind"] + law(f"{own['file']}:{own['law']}"))
@@ -55,18 +55,18 @@ def model(text: str) -> str:
 
 
 def models(text: str) -> list[str]:
-    """Names of friction models with commas between them, for argparse."""
+    """Comma-separated names of friction models, for argparse."""
     names = [model(name) for name in text.split(",") if name.strip()]
     if not names:
-        raise argparse.ArgumentTypeError(f"takes names of models, got none; there are {MODELS}")
+        raise argparse.ArgumentTypeError(f"needs names of models, got none; there are {MODELS}")
     return names
 
 
 def law(text: str) -> str:
-    """The name of a law of one's own, FILE.py:LAW, known from now on, for argparse."""
+    """The name of a law in FILE.py:LAW, which it registers, for argparse."""
     own = _OWN_LAW.fullmatch(text.strip())
     if own is None or own["kind"]:
-        raise argparse.ArgumentTypeError(f"takes a law as my.py:LAW, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be a law as my.py:LAW, got {text!r}")
     from nfriction.friction import add_law
     from nfriction.friction.laws import Law
 
@@ -105,17 +105,17 @@ def rig(text: str) -> str:
 
 
 def _similar(text: str, names: Iterable[str]) -> str:
-    """A question for the name that may be meant; empty where none is near."""
+    """A question that suggests a similar name; empty if there is none."""
     by_lower = {name.lower(): name for name in names}
     near = difflib.get_close_matches(text.lower(), by_lower, 1)
     return f" (did you mean {by_lower[near[0]]}?)" if near else ""
 
 
 def file(text: str) -> Path:
-    """A file that is there, for argparse."""
+    """An existing file, for argparse."""
     path = Path(text)
     if not path.is_file():
-        what = "is no file" if path.exists() else "is not there"
+        what = "is not a file" if path.exists() else "does not exist"
         raise argparse.ArgumentTypeError(f"{text} {what}; check the path")
     return path
 
@@ -131,7 +131,7 @@ def jobs(text: str) -> int:
     """A number of processes from 1, or -1, for argparse."""
     if text != "-1" and not (text.isdecimal() and int(text)):
         raise argparse.ArgumentTypeError(
-            f"must be a whole number from 1, or -1 for one to each core, got {text!r}"
+            f"must be a whole number from 1, or -1 for one per core, got {text!r}"
         )
     return int(text)
 
@@ -143,17 +143,17 @@ def positive(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"takes one number above 0, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be one number above 0, got {text!r}")
     return value
 
 
 def positives(text: str) -> tuple[float, ...]:
-    """Positive numbers with commas between them, for argparse."""
+    """Comma-separated positive numbers, for argparse."""
     try:
         return tuple(map(positive, text.split(",")))
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(
-            f"takes positive numbers like 0.5,2, got {text!r}"
+            f"must be positive numbers like 0.5,2, got {text!r}"
         ) from None
 
 
@@ -161,7 +161,7 @@ def columns(text: str) -> dict[str, str]:
     """Names of columns, ours and the file's, for argparse."""
     pairs = [part.split("=", 1) for part in text.split(",")]
     if any(len(pair) < 2 or not all(map(str.strip, pair)) for pair in pairs):
-        raise argparse.ArgumentTypeError(f"takes pairs like time=t,q1=enc_1, got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be pairs like time=t,q1=enc_1, got {text!r}")
     return {ours.strip(): theirs.strip() for ours, theirs in pairs}
 
 
@@ -196,22 +196,22 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add("--max-steps", type=count, default=30, metavar="N",
         help="limit of search steps at each window length (default: 30)")  # fmt: skip
     add("--loss", choices=CHOICES["loss"], default="linear",
-        help="loss of an error: linear for least squares; the others count spikes of a sensor less "
+        help="loss function: linear for least squares; the others give sensor spikes less weight "
         "and name them (default: linear)")  # fmt: skip
     add("--fit-delay", action="store_true",
-        help="estimate by how much torques are recorded later than positions")  # fmt: skip
+        help="estimate the delay of recorded torques relative to positions")  # fmt: skip
 
 
 def add_reading_options(parser: argparse._ActionsContainer) -> None:
-    """Options that say how recordings are written."""
+    """Options that describe how recordings are written."""
     add = parser.add_argument
     add("--angles", metavar="HOW,ZERO",
         help="angle convention of the recordings: relative or absolute, from upright or hanging, "
-        "e.g. absolute,hanging (default: of the file or the rig)")  # fmt: skip
+        "e.g. absolute,hanging (default: that of the file or the rig)")  # fmt: skip
     add("--degrees", action="store_true", help="the recordings are in degrees")
     add("--columns", type=columns, metavar="OURS=THEIRS,...",
-        help="the files' names of time, q1, ..., tau1, ... (of a motor: motor1, current1) where "
-        "they differ, each perhaps with its unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
+        help="the files' column names for time, q1, ..., tau1, ... (of motors: motor1, current1), "
+        "optionally with a unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
         )  # fmt: skip
 
 
@@ -265,7 +265,7 @@ def read_recordings(
         theirs, _, _ = pairs[ours].partition(":")
         warn(
             f"{', '.join(in_degrees)}: positions look like degrees or encoder counts; if so, add "
-            f"--degrees, or state the counts of a turn, as in --columns {ours}={theirs}"
+            f"--degrees, or state the counts per turn, as in --columns {ours}={theirs}"
             ":counts/8192."
         )
     return recordings

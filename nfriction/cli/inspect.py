@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def add_report(commands: Commands) -> None:
     """Register `report`."""
     parser = commands.add(
-        "report", run_report, "write a page of a comparison's folder",
-        description="Write the folder of compare or demo as one self-contained HTML file: tables "
-        "that sort, figures that zoom, fuzzy rules, verdicts.",
+        "report", run_report, "write an HTML page of a comparison's folder",
+        description="Write the folder of compare or demo as one self-contained HTML file: sortable "
+        "tables, figures that zoom, fuzzy rules, verdicts.",
         example="nfriction report runs/mine --out mine.html",
     )  # fmt: skip
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
@@ -36,7 +36,7 @@ def run_report(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{arguments.folder} is no folder; give one that compare or demo wrote.")
     out = arguments.out or arguments.folder / "report.html"
     if out.is_dir():
-        raise UsageError(f"--out is a file, and {out} is a folder.")
+        raise UsageError(f"--out must be a file, but {out} is a folder.")
     for note in write_report(arguments.folder, out).notes:
         warn(note)
     print(f"wrote {out}")
@@ -108,8 +108,8 @@ def add_data(commands: Commands) -> None:
     parser = commands.add(
         "data", run_data, "list or fetch public recordings",
         description="List public recordings of real mechanisms, or fetch their originals from "
-        "GitHub and convert them to tables in SI. Originals that are in the folder are not "
-        "fetched again.",
+        "GitHub and convert them to tables in SI units. Originals that are already in the folder "
+        "are not fetched again.",
         example="nfriction data get multiarm-triple",
     )  # fmt: skip
     parser.add_argument("action", choices=("list", "get"), help="list the sets, or get some")
@@ -118,7 +118,7 @@ def add_data(commands: Commands) -> None:
 
 
 def run_data(arguments: argparse.Namespace) -> int:
-    """List or fetch; the status is 1 where a table is not that of the documentation."""
+    """List or fetch; the status is 1 if a table differs from that of the documentation."""
     from nfriction.io.public_data import fetch, public_sets
 
     sets = public_sets()
@@ -136,8 +136,8 @@ def run_data(arguments: argparse.Namespace) -> int:
         fetched = fetch(name, folder)
         if fetched.differing:
             status = 1
-            warn(f"{', '.join(fetched.differing)}: not the table that the documentation used "
-                 "(SHA-256 differs); results may differ, too")  # fmt: skip
+            warn(f"{', '.join(fetched.differing)}: differs from the table that the documentation "
+                 "used (by SHA-256); results may also differ")  # fmt: skip
         print(f"{name}: {len(fetched.tables)} recordings and recordings.csv are in {folder} "
               f"({sets[name].repository}, licence: {sets[name].licence})")  # fmt: skip
     return status

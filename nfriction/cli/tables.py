@@ -13,10 +13,10 @@ from nfriction.friction.models import FrictionModel
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
     "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
-    f"{LEAD_IN:g} s before, which are\nnot scored, or from a given one; error reduction: of the "
-    "free run, against no friction, simulated on\nthe rig as given; limit of these data: largest "
-    f"error in {DRAWS} simulations with the noise of start and\ntorque, or by the integration; "
-    "=: within that of the least"
+    f"preceding {LEAD_IN:g} s, which are\nnot scored, or from a given one; error reduction: of the "
+    "free run, relative to no friction on the rig\nas given; limit of these data: largest error of "
+    f"{DRAWS} simulations with noise in start and torque, plus the\nerror of the integration; "
+    "=: differs from the smallest error by less than that limit"
 )
 
 
@@ -44,7 +44,7 @@ def error_tables(comparison: Comparison) -> str:
 
 
 def fit_lines(name: str, fit: FitResult, unfit: str = "") -> str:
-    """Usability, status and warnings of a fit; `unfit` is why its test forbids to use it."""
+    """Usability, status and warnings of a fit; `unfit` is the reason if its test forbids use."""
     verdict, reason = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     head = f"{verdict} ({reason})" if reason else verdict
@@ -73,7 +73,7 @@ def verdict(comparison: Comparison) -> str:
     """The model that predicts best, in a sentence or two."""
     best = comparison.best()
     if not comparison.test:
-        return "no verdict: there was no test recording; give some by --test"
+        return "no verdict: there was no test recording; give some with --test"
     if best is None:
         return "no verdict: every free run over the test recordings diverged"
     unfit = "".join(f"\nnot fit for use: {name}: {why}" for name, why in comparison.unfit().items())
@@ -100,7 +100,7 @@ def _best(comparison: Comparison, best: str) -> str:
 
 
 def coefficient_table(model: FrictionModel, joint_names: Sequence[str], unit: str) -> str:
-    """Coefficients by joint with their units, and by where they apply where that differs."""
+    """Coefficients by joint with their units, and by range of validity if they have several."""
     joints = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
     sets, units = coefficients_by_set(model), tables.coefficient_units(model, unit)
     return str(tables.coefficient_table(type(model).__name__, joints, sets, units))

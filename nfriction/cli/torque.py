@@ -22,17 +22,17 @@ def add_fit(commands: Commands) -> None:
     """Register `fit-torque`."""
     parser = commands.add(
         "fit-torque", run_fit, "fit models to friction torque over velocity",
-        description="Fit friction models to a table of friction torque over velocity, of "
-        "constant-velocity tests or the residual torque of an inverse dynamics, and compare them "
-        "on blocks left out.",
+        description="Fit friction models to a table of friction torque over velocity, from "
+        "constant-velocity tests or the residuals of inverse dynamics, and compare them on "
+        "blocks left out.",
         example="nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck "
         "--out runs/joint",
     )  # fmt: skip
     add = parser.add_argument
     add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
     add("--models", type=inputs.models,
-        help=f"with commas between them: {inputs.MODELS} (default: all constant laws that the "
-        "columns allow)")  # fmt: skip
+        help=f"comma-separated: {inputs.MODELS} (default: all constant laws that the columns allow)"
+        )  # fmt: skip
     add("--out", type=Path, default=Path("runs/torque"), help="folder to write")
     add("--folds", type=inputs.count, default=10, metavar="N",
         help="blocks that are left out in turn")  # fmt: skip
@@ -45,8 +45,8 @@ def add_score(commands: Commands) -> None:
     """Register `score-torque`."""
     parser = commands.add(
         "score-torque", run_score, "score models on friction torque over velocity",
-        description="Predict the friction torque of a table by a model file, or by the models that "
-        "fit-torque chose, and print the error of each joint.",
+        description="Predict the friction torque of a table with a model file, or with the models "
+        "that fit-torque chose, and print the error of each joint.",
         example="nfriction score-torque runs/joint other_table.csv",
     )  # fmt: skip
     add = parser.add_argument
@@ -58,8 +58,8 @@ def add_score(commands: Commands) -> None:
 def _add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--degrees", action="store_true", help="velocities are in degrees")
     parser.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
-                        help="the table's names of qd, tau, ... where they differ, with a unit "
-                        "where it is not SI, e.g. qd=speed:rpm,tau=torque")  # fmt: skip
+                        help="the table's names for qd, tau, ..., with a unit if it is not SI, "
+                        "e.g. qd=speed:rpm,tau=torque")  # fmt: skip
 
 
 def run_fit(arguments: argparse.Namespace) -> int:
@@ -91,7 +91,7 @@ def run_score(arguments: argparse.Namespace) -> int:
     from nfriction.evaluation.torque_tables import read_models, score_models
 
     if not arguments.model.exists():
-        raise UsageError(f"{arguments.model} is not there; check the path.")
+        raise UsageError(f"{arguments.model} does not exist; check the path.")
     models = read_models(arguments.model)
     print(_printed(score_models(models, _read(arguments, models[0].unit))))
     return 0

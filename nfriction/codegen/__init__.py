@@ -1,6 +1,6 @@
 """Compiled code from torch modules: rollouts for scoring, functions for controllers.
 
-Knows nothing of plants or friction beyond the methods it calls.
+This package knows plants and friction only through the methods that it calls.
 """
 
 from nfriction.codegen.function import CompiledFunction

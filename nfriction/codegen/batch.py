@@ -1,4 +1,4 @@
-"""Batches: arguments as compiled code reads them, and the code that works through their rows."""
+"""Batches: arguments in the form that compiled code reads, and the code that loops over rows."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -18,9 +18,9 @@ from nfriction.codegen.ir import Body
 Array = np.ndarray
 
 AXES = ("row", "step", "element")
-# Rows computed together where all share their parameters.
+# Rows computed together if all share their parameters.
 WIDTH = 8
-# From that many rows on they are; it costs another compilation.
+# Smallest number of rows for which this pays, since it costs another compilation.
 FEW = 3
 
 
@@ -72,7 +72,7 @@ def _strided(array: Array) -> Series:
 
 
 def common_rows(rows: Mapping[str, int]) -> int:
-    """The one number of rows that all arguments agree on; single rows are for all."""
+    """The number of rows on which all arguments agree; single rows apply to all."""
     counts = {count for count in rows.values() if count != 1} or {1}
     if len(counts) > 1:
         shown = ", ".join(f"`{name}` {count}" for name, count in rows.items() if count != 1)
@@ -83,9 +83,9 @@ def common_rows(rows: Mapping[str, int]) -> int:
 def parameter_rows(
     module: FunctionalModule, overrides: Mapping[str, Any]
 ) -> tuple[Array, dict[str, int]]:
-    """Parameter vectors, one row a candidate (or one for all), and the rows that each name gave.
+    """Parameter vectors, one row per candidate (or one for all), and the rows given by each name.
 
-    Overrides are of the parameter's shape or (candidate, *shape); other values are the module's.
+    Overrides have the parameter's shape or (candidate, *shape); other values are the module's.
     """
     unknown = [name for name in overrides if name not in module.shapes]
     if unknown:
@@ -127,16 +127,16 @@ class Layout:
 
 
 class Driver:
-    """Text of an entry point that works through rows `first` to `last`, some of them together.
+    """Text of an entry point that processes rows `first` to `last`, some of them together.
 
-    What functions of the graph read and write are arrays in the caller's working room; every
-    element has a place for each row that is computed together with others.
+    Functions of the graph read and write arrays in the caller's workspace; every element has a slot
+    for each row that is computed together with others.
 
     Args:
         layout: its arguments.
         width: rows computed together as vectors, which then share all parameters; 0 for one.
-        sizes: elements of each array in the room.
-        once: values computed once, of which there is one each.
+        sizes: elements of each array in the workspace.
+        once: values computed once, with one slot each.
     """
 
     def __init__(self, layout: Layout, width: int, sizes: Mapping[str, int], once: int) -> None:
@@ -254,7 +254,7 @@ class Kernel:
             given: series by name; one that is left out must not be read.
             outputs: contiguous arrays to write to, by name.
             settings: further numbers.
-            threads: rows are shared out among this many.
+            threads: number of threads that share the rows.
         """
         own = len(parameters) > 1
         numbers = {"p_row": parameters.shape[1] if own else 0, **(settings or {})}
@@ -276,7 +276,7 @@ class Kernel:
         if min(threads, rows) <= 1:
             part(0, rows)
             return
-        # More parts than threads, since candidates that diverge early leave a thread idle.
+        # More parts than threads, because candidates that diverge early leave a thread idle.
         borders = np.linspace(0, rows, min(rows, 4 * threads) + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads) as pool:
             for job in [pool.submit(part, *pair) for pair in pairwise(borders)]:

@@ -1,7 +1,7 @@
 """Scalar nodes as LLVM IR, one number at a time or a vector of independent ones.
 
-Products are fused into sums here, by the graph alone, and not by LLVM: so the same graph gives the
-same bits whatever is computed beside it, a single candidate or a batch.
+Products are fused into sums here, depending only on the graph, and not by LLVM: so the same graph
+gives the same bits for a single candidate and in a batch.
 """
 
 from collections import Counter
@@ -33,13 +33,13 @@ def write_function(
     Args:
         body: the module.
         name: of the function.
-        outputs: nodes by the name of the array that takes them.
-        places: array and index of each node that is given.
-        shared: names of the arrays that never change and hold one number an element.
-        inputs: names of the other arrays that are read; an output may be one of them, for all of
-            them are read before any is written.
-        width: numbers an element of these and of `outputs` has, one below the other; 0 for one.
-        seldom: it runs once a rollout, so brief code counts more than speed.
+        outputs: nodes by the name of the array to which they are written.
+        places: array and index of each given node.
+        shared: names of the arrays that never change and have one number per element.
+        inputs: names of the other arrays that are read; an output may be one of them, because all
+            of them are read before any is written.
+        width: numbers per element of these and of `outputs`, consecutive in memory; 0 for one.
+        seldom: it runs once per rollout, so short code matters more than speed.
     """
     given = [*shared, *dict.fromkeys([*inputs, *outputs])]
     heads = [f"ptr {'noalias readonly ' if a in shared else ''}%{a}" for a in given]
@@ -103,14 +103,14 @@ class _Writer:
         return found
 
     def _number(self, node: Node) -> str:
-        """The same as a number: truth counts as one."""
+        """The value as a number: true counts as one."""
         text = self._value(node)
         if not is_predicate(node):
             return text
         return self.body.let(f"uitofp {truth(self.width)} {text} to {real(self.width)}")
 
     def _truth(self, node: Node) -> str:
-        """The same as a truth value: whatever is not zero is true, NaN too."""
+        """The value as a truth value: anything except zero is true, including NaN."""
         text = self._value(node)
         if is_predicate(node):
             return text
@@ -128,7 +128,7 @@ class _Writer:
         return self.body.let(f"shufflevector {kind} {first}, {kind} poison, {every}")
 
     def _fuse(self, order: Sequence[Node], outputs: Sequence[Node]) -> None:
-        """Find products that nothing but a single sum reads."""
+        """Find products that only a single sum reads."""
         computed = [n for n in order if n.number not in self.places]
         uses = Counter(a.number for n in computed for a in n.args)
         uses.update(n.number for n in outputs)
@@ -144,7 +144,7 @@ class _Writer:
                     break
 
     def _phases(self, order: Sequence[Node]) -> None:
-        """Write all nodes; calls that do not wait for each other share vectors."""
+        """Write all nodes; calls that are independent of each other share vectors."""
         phase: dict[int, int] = {}
         for node in order:
             before = [] if node.number in self.places else node.args

@@ -24,8 +24,8 @@ from nfriction.codegen.scalar import SelfCheckFailed
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
-# Kernels kept in memory by what they compute, with the shapes of their outputs: fits to parts of
-# the data, or from several starts, share theirs. Six laws have twelve, of some ten megabytes each.
+# Kernels cached by their computation, with the shapes of their outputs: fits to parts of the data,
+# or from several starts, share them. Six laws have twelve, of about ten megabytes each.
 _KEPT = 16
 _known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
@@ -37,12 +37,12 @@ class CompiledFunction:
         function: a module, a bound method of one (its parameters stay inputs, read at every
             call), or any callable (tensors it closes over are baked in).
         example_inputs: float64 tensors of the right shapes, without a batch dimension.
-        jacobian: positions of the inputs by which to differentiate; the exact Jacobian, (elements
-            of all outputs, elements of these inputs), is then returned last.
+        jacobian: indices of the inputs in which to differentiate; the exact Jacobian, (elements of
+            all outputs, elements of these inputs), is then returned last.
 
     Raises:
         UnsupportedOperation: it uses an operation that has no scalar form here.
-        SelfCheckFailed: compiled values are not the eager ones.
+        SelfCheckFailed: compiled values differ from eager ones.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class CompiledFunction:
         """Evaluate row by row.
 
         Args:
-            *inputs: arrays of shape (batch, *shape of the example); a single row is for all.
+            *inputs: arrays of shape (batch, *shape of the example); a single row applies to all.
 
         Returns:
-            One array (batch, *shape), or a tuple of them where the function returns several.
+            One array (batch, *shape), or a tuple of them if the function returns several.
 
         Raises:
             ValueError: if shapes do not fit.
@@ -107,8 +107,8 @@ class CompiledFunction:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         generator = torch.Generator().manual_seed(0)
-        # At the examples themselves a kink may lie, where derivatives of both sides are right.
-        # Relative to the examples, since functions may grow without bound where signs change.
+        # The examples themselves may lie at a kink, where derivatives of both sides are correct.
+        # Relative to the examples, because functions may grow without bound where signs change.
         for spread in (0.1,) if self._jacobian else (0.0, 0.01, 0.1):
             inputs = [
                 x.detach()
@@ -119,7 +119,7 @@ class CompiledFunction:
             ]
             with torch.no_grad():
                 eager = self._eager([x.to(self._module.device) for x in inputs])
-            # As many rows as most calls have, so that the code for these is what is checked.
+            # As many rows as in most calls, so that their code is checked.
             ours = self(*(x.expand(FEW, *x.shape) for x in inputs))
             for a, b in zip(
                 ours if isinstance(ours, tuple) else (ours,),

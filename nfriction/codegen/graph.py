@@ -1,11 +1,11 @@
 """Trace torch code into a graph of scalars.
 
-The function runs once on `ScalarTensor`s: tensors that hold an array of scalar nodes beside an
+The function runs once on `ScalarTensor`s: tensors with an array of scalar nodes in addition to an
 example value. Every ATen operation that reaches the dispatcher (composite ones arrive already
-decomposed) acts on both, so views cost nothing, writing in place is seen through views, two equal
-tensors stay two inputs, and shapes and dtypes are torch's own. Where Python asks for a value (`if
-x > 0`, `.item()`) the trace stops with an error instead of baking one branch. Tracing takes
-milliseconds where `torch.export` takes seconds.
+decomposed) acts on both, so views cost nothing, in-place writes are visible through views, two
+equal tensors remain two inputs, and shapes and dtypes are torch's own. If Python asks for a value
+(`if x > 0`, `.item()`), the trace stops with an error instead of baking in one branch. Tracing
+takes milliseconds, `torch.export` takes seconds.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nfriction.codegen.operations import OPERATIONS, constants
 from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, UpdateRate, reachable
 
-# Most elements a traced tensor, and most scalar operations a traced function, may have.
+# Limit on elements of a traced tensor, and on scalar operations of a traced function.
 LIMIT = 50_000
 
 
@@ -44,7 +44,7 @@ class Program:
     outputs: tuple[Port, ...]
 
     def digest(self) -> str:
-        """A hash of all that is computed: inputs, operations, constants and outputs."""
+        """A hash of the whole computation: inputs, operations, constants and outputs."""
         nodes = reachable(node for port in self.outputs for node in port.nodes)
         ports = [
             (port.name, port.shape, [node.number for node in port.nodes])
@@ -158,7 +158,7 @@ def _interpret(
 
 
 def _each(function: Callable[[Any], Any], value: Any) -> Any:
-    """The function of a value, or of each in lists; torch's own `tree_map` takes half a trace."""
+    """Map a function over nested lists; torch's own `tree_map` takes half the time of a trace."""
     if isinstance(value, (list, tuple)):
         return [_each(function, x) for x in value]
     return function(value)
@@ -187,7 +187,7 @@ def _write(target: ScalarTensor, nodes: np.ndarray, name: str) -> ScalarTensor:
 def _reshape_in_place(
     target: ScalarTensor, nodes: np.ndarray, func: Any, args: Any, kwargs: Any
 ) -> ScalarTensor:
-    """`squeeze_` and its like (torch's own `linear` uses it) change shape and strides only."""
+    """`squeeze_` and similar (torch's own `linear` uses it) only change shape and strides."""
     included = torch._C._meta_in_tls_dispatch_include()
     torch._C._set_meta_in_tls_dispatch_include(True)
     try:
@@ -229,7 +229,7 @@ def trace(
 
     Args:
         function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
-        inputs: example tensors, float64; each becomes an input of its own.
+        inputs: example tensors, float64; each becomes a separate input.
         parameters: names of the inputs that stay the same over many calls.
     """
     graph, ports, arguments = Graph(), [], {}
@@ -238,7 +238,7 @@ def trace(
             raise ValueError(
                 f"`{name}` must be float64, got {example.dtype}; call `.double()` on the module."
             )
-        # A copy each: inputs never share memory, whatever the caller passed.
+        # Copies, so that inputs never share memory.
         example = example.detach().to("cpu").clone(memory_format=torch.contiguous_format)
         rate = UpdateRate.PARAMETER if name in parameters else UpdateRate.STEP
         nodes = [graph.input(name, i, rate) for i in range(example.numel())]
@@ -246,7 +246,7 @@ def trace(
         array = np.empty(len(nodes), dtype=object)
         array[:] = nodes
         arguments[name] = ScalarTensor(array.reshape(tuple(example.shape)), example, graph)
-    # Without gradients: autograd would wrap every traced tensor for nothing.
+    # Without gradients, because autograd would needlessly wrap every traced tensor.
     with torch.no_grad(), _Watch(graph):
         outputs = function(**arguments)
     outputs = outputs if isinstance(outputs, (tuple, list)) else (outputs,)
@@ -263,7 +263,7 @@ def _output(graph: Graph, index: int, output: Any) -> Port:
 class FunctionalModule:
     """A module whose floating-point parameters and buffers are inputs named p0, p1, ...
 
-    Integer and boolean buffers stay constants: they index and select, which has to be known when
+    Integer and boolean buffers stay constants: they index and select, so they must be known when
     code is emitted.
 
     Args:
@@ -284,7 +284,7 @@ class FunctionalModule:
 
     @property
     def device(self) -> torch.device:
-        """The device of the module, by its first tensor."""
+        """The device of the module's first tensor."""
         return next((t.device for t in self._state().values()), torch.device("cpu"))
 
     def value(self, name: str) -> Tensor:
@@ -294,7 +294,7 @@ class FunctionalModule:
         return value
 
     def trace(self, inputs: Mapping[str, Tensor]) -> Program:
-        """Trace `module(**inputs)` by examples; the program's first inputs are the parameters."""
+        """Trace `module(**inputs)` with examples; the program's first inputs are the parameters."""
         state = self._state()
         parameters = {f"p{i}": state[name] for i, name in enumerate(self.shapes)}
 

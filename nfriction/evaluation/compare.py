@@ -29,13 +29,13 @@ NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
 JUDGED_BY = "free-run RMSE over all joints and test recordings"
 SCHEMA = 4
-"""Of `results.json`; the third had no `zero`, the second a `floor` by one encoder count in place of
-the `limit`, the first no number, and `held_out` where it now says `test`."""
+"""Of `results.json`; the third had no `zero`, the second a `floor` from one encoder count in place
+of the `limit`, the first no number and `held_out` in place of `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
-# Of a test recording's samples may be faster than any that was trained on.
+# Share of a test recording's samples that may be faster than all training samples.
 FASTER = 0.01
-# So many times the error of a model no larger cannot be the luck of a few test recordings.
+# An error this many times that of a model no larger cannot be chance in a few test recordings.
 FAR_WORSE = 2.0
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 Part = Literal["train", "test"]
@@ -46,7 +46,7 @@ class Fits(dict[str, FitResult]):
     """Fits by the model's name, which may be the plain one: `fits["coulomb-viscous"]`."""
 
     def __missing__(self, name: str) -> FitResult:
-        with suppress(ValueError):  # of a text that names no model
+        with suppress(ValueError):  # the text names no model
             known = model_name(name)
             if known in self:
                 return self[known]
@@ -59,11 +59,11 @@ class Comparison:
 
     Attributes:
         fits: by model name, see `Fits`.
-        train, test: scores by model name, then recording, `"no friction"` among them.
+        train, test: scores by model name, then recording, including `"no friction"`.
         unit: of the errors, `"rad"` or `"m"`.
         joint_names: columns of the tables.
-        horizons_asked: window lengths that were to be scored [s].
-        failed: why a model was not fitted, by its name.
+        horizons_asked: requested window lengths of the scores [s].
+        failed: reason why a model was not fitted, by its name.
     """
 
     fits: dict[str, FitResult]
@@ -93,7 +93,7 @@ class Comparison:
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """`"test"` and `"train"`, as far as recordings of them were scored."""
+        """`"test"` and `"train"`, if recordings of that part were scored."""
         return tuple(part for part in PART_NAMES if getattr(self, part))
 
     def scores(self, part: Part = "test") -> dict[str, list[Score]]:
@@ -126,7 +126,7 @@ class Comparison:
         return pd.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("model")
 
     def improvement(self, horizon: str | None = None, *, part: Part = "test") -> pd.DataFrame:
-        """Error reduction against the first model, no friction [%]; NaN where both diverged.
+        """Error reduction relative to the first model, no friction [%]; NaN where both diverged.
 
         References:
             TLRIP paper, Table 11.
@@ -136,7 +136,7 @@ class Comparison:
             return 100.0 * (1.0 - table / table.iloc[0])
 
     def horizons(self, part: Part | None = None) -> list[str]:
-        """Window lengths that every recording has; of a part, or by default of both."""
+        """Window lengths scored on every recording of a part, by default of both parts."""
         parts = tuple(PART_NAMES) if part is None else (part,)
         scores = [s for p in parts for of_model in getattr(self, p).values() for s in of_model]
         return [h for h in scores[0].windows if all(h in s.windows for s in scores)]
@@ -182,8 +182,8 @@ class Comparison:
     def best(self) -> str | None:
         """The model that predicts the test recordings best, `"no friction"` included.
 
-        Judged by the free run over all joints and recordings; of those that are equal within a
-        thousandth, the one with the fewest parameters. None where there is no test recording, or
+        Judged by the free run over all joints and recordings; among models that are equal within a
+        thousandth, the one with the fewest parameters. None if there is no test recording, or
         every free run diverged.
         """
         if not self.test:
@@ -196,18 +196,18 @@ class Comparison:
     def limit(
         self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
     ) -> float | None:
-        """Error that noise and integration may cause in simulations of the best model.
+        """Error that noise and integration can cause in simulations of the best model.
 
         Smaller differences between models are not meaningful.
 
         Args:
             horizon: window length as in `Score.windows`; None for the free run.
             column: joint of the tables, or `"all"`.
-            part: over which recordings.
+            part: `"test"` or `"train"`.
 
         Returns:
-            Root mean square over them [rad or m]; None where it was not asked for or a simulation
-            diverged.
+            Root mean square over its recordings [rad or m]; None if the limit was not requested or
+            a simulation diverged.
         """
         place = [*self.joint_names, "all"].index(column)
         squares = []
@@ -220,15 +220,15 @@ class Comparison:
         return limit if np.isfinite(limit) else None
 
     def nearest(self, part: Part) -> str:
-        """The model with the least error of free runs; no friction where it is alone."""
+        """The model with the smallest free-run error; no friction if there is no other."""
         free_run = self.table(part=part)["all"]
         models = free_run.drop(NO_FRICTION, errors="ignore")
         return str((free_run if models.empty else models).idxmin())
 
     def indistinguishable(self) -> tuple[str, ...]:
-        """The best and all models within the limit of it, `"no friction"` among them.
+        """The best model and all within the limit of it, including `"no friction"`.
 
-        Simplest first. The best alone where there is no limit; empty where there is no best.
+        Simplest first. Only the best if there is no limit; empty if there is no best.
         """
         best = self.best()
         if best is None:
@@ -240,8 +240,8 @@ class Comparison:
     def unfit(self) -> dict[str, str]:
         """Models not to be used, with the reason: one no larger predicts the test far better.
 
-        A model worse than no friction, or at least twice as bad as one with no more parameters by
-        more than the limit of these data, extrapolates wrongly; any that errs as much is no fitter.
+        A model extrapolates wrongly if no friction, or with half its error a model with no more
+        parameters, is better by more than the limit of these data. Any larger error is unfit, too.
         """
         if not self.test:
             return {}
@@ -275,7 +275,7 @@ class Comparison:
         """Write a recording and its simulation by the best model as a GIF; see `plots.animate`.
 
         Raises:
-            ValueError: if it is not among the recordings compared, or nothing was fitted.
+            ValueError: if the recording was not compared, or nothing was fitted.
         """
         from nfriction import plots
 
@@ -335,31 +335,31 @@ def compare(
 ) -> Comparison:
     """Fit models and score each on every recording.
 
-    No friction is scored on the plant as given, so it does not depend on any model's fit; each
-    model is scored on the plant that was fitted with it.
+    The case without friction is scored on the plant as given, so that it does not depend on any
+    fit; each model is scored on the plant that was fitted with it.
 
     Args:
         plant: the mechanism as given, its name, or the path of a rig file.
-        models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first:
+        models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first: other
             constant laws start from its plant terms, an adaptive or neuro-fuzzy model from the
             constant fit of its law.
         train: recordings to fit, or one; also paths of files and tables, see `Recording.of`.
-        test: recordings to judge by, or one; never seen by a fit.
+        test: recordings for testing, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of
             other recordings start from a lead-in, see `score`.
         horizons: window lengths of the scores [s].
-        progress: receives what is being done; steps only of searches in this process.
-        jobs: fits at the same time, each in a process of its own; -1 for one to each core. The
-            result does not depend on it. Above 1 it needs joblib, whose `parallel_config`
-            chooses another backend, such as a Dask cluster.
+        progress: receives the current stage, and the steps of searches in this process.
+        jobs: number of parallel fits, each in its own process; -1 for one per core. The result
+            does not depend on it. Above 1 it needs joblib, whose `parallel_config` selects
+            another backend, such as a Dask cluster.
         fit_settings: see `fit`.
 
     Raises:
         ValueError: if a recording is in both parts, or lacks a torque that a law reads, or names
             are not unique.
         ImportError: if `jobs` needs joblib and it is not installed.
-        ValueError, ArithmeticError, RuntimeError: if no model could be fitted; where only some
-            could not, `failed` has the reasons.
+        ValueError, ArithmeticError, RuntimeError: if no model could be fitted; if only some could
+            not, `failed` has the reasons.
     """
     models = [models] if isinstance(models, str) else models
     horizons = checked_lengths("horizons", horizons, 0)
@@ -406,12 +406,12 @@ def compare(
 
 
 def _warn_of_faster(plant: Plant, trained: Sequence[Motion], test: Sequence[Recording]) -> None:
-    """Warn of test recordings faster than all of training: friction there is extrapolated."""
+    """Warn of test recordings faster than all training recordings: friction is extrapolated."""
     fastest, found = np.max([np.abs(m.qd).max(0) for m in trained], axis=0), []
     for recording in test:
         joint = recording.joint_coordinates(plant)
         moved = kalman_smoother(joint.time, joint.q)
-        # Noise alone is faster than another noise in half of all cases.
+        # Pure noise exceeds other pure noise in half of all cases.
         noise = 0.0 if moved.std is None else 2.0 * moved.std.qd
         speeds = np.quantile(np.abs(moved.qd) - noise, 1.0 - FASTER, axis=0)
         place = recording.name or "a recording"
@@ -432,13 +432,13 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
     """Require distinct names, and test recordings that no fit sees.
 
     Raises:
-        ValueError: names that repeat, or a recording in both parts, whatever its names.
+        ValueError: repeated names, or a recording in both parts, whatever its names.
     """
     trained = {recording.digest() for recording in train}
     seen = [r.name or "a recording" for r in test if r.digest() in trained]
     if seen:
         raise ValueError(
-            f"{', '.join(seen)}: both trained on and tested on; a model is judged by recordings it "
+            f"{', '.join(seen)}: used for training and testing; test a model on recordings that it "
             f"has not seen."
         )
     names = [r.name for r in (*train, *test)]
@@ -446,13 +446,13 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
     if repeated:
         raise ValueError(
             f"recordings must have different names, {', '.join(repeated)} repeats; rename one, in "
-            f"Python by the `name` of `Recording`."
+            f"Python with the `name` of `Recording`."
         )
 
 
 def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:
-    """Coefficients by where they apply and by name, a value a joint."""
-    # All but the heat itself, of which a motion has none at its start.
+    """Coefficients by range of validity and by name, one value per joint."""
+    # Without the coefficient of heat, because a motion starts cold.
     shown = [(k, c.name) for k, c in enumerate(model.law.coefficients) if c != HEAT]
     return {
         label: {name: values[:, k].tolist() for k, name in shown}
@@ -461,6 +461,6 @@ def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]
 
 
 def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
-    """Coefficients by name, a value a joint; by set first where a model has several."""
+    """Coefficients by name, one value per joint; first by set if a model has several."""
     sets = coefficients_by_set(model)
     return sets.get("always", sets)

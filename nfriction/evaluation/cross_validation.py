@@ -22,7 +22,7 @@ from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import Motion, kalman_smoother
 
-# Relative difference of errors that counts as none.
+# Relative difference of errors that counts as a tie.
 TOLERANCE = 0.02
 # Fewer samples say nothing about a law.
 SHORTEST_BLOCK = 100
@@ -36,7 +36,7 @@ class TimeBlock(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """A block of a recording to test on, and the rest of it to train on."""
+    """A block of a recording for testing, and the rest of it for training."""
 
     test: TimeBlock
     train: TimeBlock
@@ -71,9 +71,9 @@ class Selection:
 
     Attributes:
         chosen: name of the model.
-        reason: why, in a sentence.
+        reason: for the choice, in a sentence.
         candidates: all models, in the order given.
-        horizon: length of the simulations that were judged [s].
+        horizon: length of the scored simulations [s].
         unit: of the errors.
     """
 
@@ -94,7 +94,7 @@ class Selection:
         return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON; a diverged block has null for a number."""
+        """Plain JSON; null in place of a number for a diverged block."""
         return {
             "chosen": self.chosen,
             "reason": self.reason,
@@ -126,18 +126,18 @@ def select(
     """Choose a friction model from training recordings alone.
 
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
-    block of every recording out, fits all models to the rest and simulates the blocks left out;
-    where encoders were zeroed at the start of each recording, with the offsets estimated from the
-    rest. A model with fewer parameters is preferred where its error is statistically tied with the
-    least one: within 2 %, or within the standard error of the difference over blocks, both of their
-    mean squares and of the logarithms: one block of violent motion must not hide that it is worse
-    on all others.
+    block of every recording out, fits all models to the rest and simulates the hold-out blocks; if
+    encoders were zeroed at the start of each recording, with the offsets estimated from the rest. A
+    model with fewer parameters is preferred if its error is statistically tied with the smallest
+    one: within 2 %, or within the standard error of the difference over blocks, both in mean square
+    and in logarithm, because one block of violent motion must not hide that the model is worse on
+    all others.
 
     Args:
         plant, models, progress, jobs, fit_settings: as in `compare`.
         recordings: training recordings.
         folds: at least 2.
-        horizon: length of the simulations [s]; a block where that is shorter.
+        horizon: length of the simulations [s], or of a shorter block.
 
     Raises:
         ValueError: if there are fewer than two folds, no model or no recording, or a recording is
@@ -150,20 +150,20 @@ def select(
     recordings = Recording.many(recordings, plant=plant)
     if not isinstance(folds, Integral) or folds < 2 or not models or not recordings:
         raise ValueError(
-            "a choice needs models, recordings and a whole number of at least 2 folds, got "
+            "selection needs models, recordings and a whole number of at least 2 folds, got "
             f"{len(models)} models, {len(recordings)} recordings and {folds!r} folds."
         )
     names = list(dict.fromkeys(map(model_name, models)))
     by_recording = [blocked_k_fold(plant, recording, folds) for recording in recordings]
     if fit_settings.get("encoder_reference", "auto") == "auto":
-        # Blocks no longer show where their recording began.
+        # A block alone does not show the start of its recording.
         per_recording = looks_zeroed_per_recording(plant, recordings)
         fit_settings["encoder_reference"] = "per_recording" if per_recording else "shared"
     horizon = min(horizon, *(longest_window(f.test.recording) for row in by_recording for f in row))
     train, test = {}, {}
     for k in range(folds):
         label = f"fold {k + 1} of {folds}: fit"
-        # Staggered, so that no fold lacks the same stretch of every recording.
+        # Staggered, so that no fold leaves out the same part of every recording.
         chosen = [row[(k + i) % folds] for i, row in enumerate(by_recording)]
         test[label] = [fold.test for fold in chosen]
         left = [fold.train for fold in chosen]
@@ -174,10 +174,10 @@ def select(
 
 
 def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]:
-    """Folds of a recording, each with one of `count` blocks of time to test on.
+    """Folds of a recording, each with one of `count` blocks of time for testing.
 
-    Blocks share their end samples with the rest. The whole recording is smoothed once: a block's
-    ends are then as well known as its middle.
+    Blocks share their end samples with the rest. The whole recording is smoothed once, so that a
+    block's ends are known as well as its middle.
 
     Raises:
         ValueError: if the blocks would have fewer than 100 samples.
@@ -193,7 +193,7 @@ def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]
     folds = []
     for first, last in pairwise(np.linspace(0, index[-1], count + 1).astype(int)):
         inside = (first <= index) & (index <= last)
-        # A block at an end of the recording leaves no lone sample behind.
+        # A block at an end of the recording leaves no single sample over.
         rest = ((index <= first) & (first > 0)) | ((last <= index) & (last < index[-1]))
         parts = ((recording[m], [x[m] for x in series]) for m in (inside, rest))
         folds.append(Fold(*(TimeBlock(of, Motion(*smoothed)) for of, smoothed in parts)))
@@ -203,7 +203,7 @@ def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
     """Root mean square position error of simulations of `horizon` seconds over each block.
 
-    With the encoder offsets that the fit found in the rest, one block a recording.
+    Encoder offsets are those that the fit found in the rest; one block for each recording.
     """
     given, motions = zip(*blocks, strict=True)
     recordings, _ = apply_encoder_offsets(found.encoder_offsets, found.plant, given, motions)
@@ -221,7 +221,7 @@ def _candidate(
     test: Mapping[str, list[TimeBlock]],
     horizon: float,
 ) -> Candidate:
-    """A model judged on the blocks that its fits have not seen."""
+    """The errors of a model on the blocks that its fits have not seen."""
     errors: list[float] = []
     converged = True
     for label, blocks in test.items():
@@ -233,10 +233,10 @@ def _candidate(
 
 
 def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str]:
-    """The model with the fewest parameters that is statistically tied with the best, and why.
+    """The model with the fewest parameters that is tied with the best, and the reason.
 
     Args:
-        candidates: with errors of the same blocks.
+        candidates: with errors on the same blocks.
         unit: of the errors.
     """
 
@@ -246,13 +246,13 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):
         simplest = min(candidates, key=lambda c: c.parameters)
-        return simplest.name, "every model diverged on a block left out; the simplest is taken."
+        return simplest.name, "every model diverged on a block left out; the simplest is chosen."
     tied = [c for c in candidates if _indistinguishable(c, best)]
     chosen = min(tied, key=lambda c: (c.parameters, c.error))
     if chosen is not best:
         return chosen.name, (
-            f"its error on blocks left out, {error(chosen)}, is statistically tied with the least, "
-            f"{error(best)} of {best.name}, and it has fewer parameters "
+            f"its error on blocks left out, {error(chosen)}, is statistically tied with the "
+            f"smallest, {error(best)} of {best.name}, and it has fewer parameters "
             f"({chosen.parameters} against {best.parameters})."
         )
     others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
@@ -261,13 +261,13 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     if math.isinf(others[0].error):
         return best.name, "every other model diverged on a block left out."
     return best.name, (
-        f"its error on blocks left out, {error(best)}, is the least; {others[0].name} follows "
+        f"its error on blocks left out, {error(best)}, is the smallest; {others[0].name} follows "
         f"with {error(others[0])}."
     )
 
 
 def _indistinguishable(one: Candidate, best: Candidate) -> bool:
-    """True where two errors differ by no more than the scatter over their blocks."""
+    """True if two errors differ by no more than their scatter over the blocks explains."""
     if not math.isfinite(one.error):
         return False
     if one.error <= (1 + TOLERANCE) * best.error:
@@ -275,5 +275,5 @@ def _indistinguishable(one: Candidate, best: Candidate) -> bool:
     squares = np.square([one.errors, best.errors])
     logarithms = np.log(squares.clip(min=DEFAULTS.min_noise**2))
     differences, n = (np.subtract(*squares), np.subtract(*logarithms)), len(one.errors)
-    # A mean is within its standard error.
+    # The mean difference is within its standard error.
     return all(d.mean() <= (d.std(ddof=1) / math.sqrt(n) if n > 1 else 0.0) for d in differences)

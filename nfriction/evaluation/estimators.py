@@ -29,7 +29,7 @@ try:
 except ImportError:
 
     class BaseEstimator:  # type: ignore[no-redef]
-        """Says what is missing as soon as an estimator is made."""
+        """Names the missing package as soon as an estimator is created."""
 
         def __new__(cls, *_: object, **__: object) -> "BaseEstimator":
             raise ImportError(
@@ -39,7 +39,7 @@ except ImportError:
 
 
 Array = NDArray[np.float64]
-# Settings of `fit` that are no matter of one call.
+# Settings of `fit` that do not belong to a single call.
 SETTINGS = {
     name: parameter
     for name, parameter in inspect.signature(fit).parameters.items()
@@ -56,9 +56,9 @@ class FrictionEstimator(BaseEstimator):
         plant: the mechanism, its name, or the path of a rig file.
         model: name of a friction model such as `"stribeck"`, or one to start from, which stays
             unchanged.
-        horizon: length of the simulations by which `score` judges [s].
-        fit_settings: keyword arguments of `nfriction.fit`, such as `drag=False`; each is a
-            parameter of the estimator, for grids, too.
+        horizon: length of the simulations in `score` [s].
+        fit_settings: keyword arguments of `nfriction.fit`, such as `drag=False`; each is also a
+            parameter of the estimator, for example in a grid search.
 
     Attributes:
         fit_: the `FitResult`; read `fit_.status` and `fit_.warnings`.
@@ -111,9 +111,9 @@ class FrictionEstimator(BaseEstimator):
             ValueError: if there is no plant, no such model, or the recordings do not fit.
         """
         if self.plant is None:
-            raise ValueError("`plant` is missing; give the mechanism, as of rigs.read('rig.json').")
+            raise ValueError("`plant` is missing; give the mechanism, as rigs.read('rig.json').")
         plant = rigs.of(self.plant)
-        # The model given is a parameter, which stays as it is.
+        # The given model is a parameter of the estimator and must stay unchanged.
         model = self.model if isinstance(self.model, str) else copy.deepcopy(self.model)
         settings = {name: getattr(self, name) for name in SETTINGS}
         self.fit_ = fit(model, plant, _recordings(X, plant), **settings)
@@ -140,7 +140,7 @@ class FrictionEstimator(BaseEstimator):
         schedule = self._fitted.model.schedule
         if schedule.follows_motion:
             raise AttributeError(
-                f"the coefficients of {type(self.model_).__name__} follow the motion; ask "
+                f"the coefficients of {type(self.model_).__name__} follow the motion; use "
                 "`model_.coefficients(qd, qdd)`."
             )
         return schedule.coefficient_sets()["always"].numpy().copy()
@@ -155,18 +155,18 @@ class FrictionEstimator(BaseEstimator):
 
         Args:
             X: velocity [rad/s], (sample, joint); or a recording, whose smoothed motion then
-                gives everything.
+                gives all arguments.
             qdd: acceleration [rad/s^2], shape like the velocity; none by default.
             load: normal load over its value at rest [-], shape like the velocity; 1 by default.
 
         Returns:
             The torque of `M(q) qdd + bias(q, qd) + tau_f = tau` [N m; N of a sliding axis],
             (sample, joint). Coefficients with a state follow the samples in their order, and so
-            does a law with memory, not deflected before the first.
+            does a law with memory, which starts undeflected.
 
         Raises:
             ValueError: if it is not fitted, shapes do not fit, or a law with memory gets no
-                recording, whose time moves it.
+                recording, whose time it needs.
         """
         model, plant = self._fitted.model, self._fitted.plant
         time: torch.Tensor | None = None
@@ -201,9 +201,9 @@ class FrictionEstimator(BaseEstimator):
         """The motion that the model predicts from a recording's lead-in and torques.
 
         Returns:
-            Table with columns time [s], q1, ... in the recording's convention and unit, a row a
-            sample, NaN from where the simulation diverged: `Recording.to_pandas` of the
-            recording has the same columns.
+            Table with columns time [s], q1, ... in the recording's convention and unit, one row
+            per sample, NaN after the simulation diverged; `Recording.to_pandas` of the recording
+            has the same columns.
         """
         (read,) = _recordings(recording, self.plant_)
         given = self._fitted.aligned(read)
@@ -216,18 +216,18 @@ class FrictionEstimator(BaseEstimator):
     def score(self, X: RecordingLike | Sequence[RecordingLike], y: object = None) -> float:
         """Minus the root mean square position error of simulations [rad; m of a sliding axis].
 
-        Simulations last `horizon` seconds (a recording where that is shorter) and are restarted
+        Simulations last `horizon` seconds (or as long as a shorter recording) and are restarted
         from the measured motion, see `nfriction.score`. Higher is better, 0 is perfect, a diverged
-        one gives -inf.
+        simulation gives -inf.
 
         Args:
-            X: recordings to judge by.
+            X: recordings to score.
             y: ignored.
         """
         errors = []
         for recording in _recordings(X, self.plant_):
             zeroed, room = bool(self._fitted.encoder_offsets), longest_window(recording)
-            # A short recording is scored from its lead-in on.
+            # A short recording is scored from the end of its lead-in.
             horizon = min(self.horizon, max(room - ZERO_IN, room / 2) if zeroed else room)
             aligned = self._fitted.aligned(recording)
             found = score(
@@ -258,7 +258,7 @@ class FrictionEstimator(BaseEstimator):
         return values
 
 
-# scikit-learn reads an estimator's parameters off its constructor.
+# scikit-learn reads an estimator's parameters from its constructor.
 _own = list(inspect.signature(FrictionEstimator.__init__).parameters.values())[:-1]
 FrictionEstimator.__init__.__signature__ = inspect.Signature([*_own, *SETTINGS.values()])  # type: ignore[attr-defined]
 
@@ -266,5 +266,5 @@ FrictionEstimator.__init__.__signature__ = inspect.Signature([*_own, *SETTINGS.v
 def _recordings(X: RecordingLike | Sequence[RecordingLike], plant: Plant) -> list[Recording]:
     """Recordings of any accepted form; a table without a unit is in the plant's."""
     if not (found := Recording.many(X, plant=plant)):
-        raise ValueError(f"recordings are needed, one or a list of them, got {X!r}.")
+        raise ValueError(f"a recording or a list of recordings is needed, got {X!r}.")
     return found

@@ -1,8 +1,8 @@
-"""Simulations of a recording's parts, each from a start estimated just before what is scored.
+"""Simulations of a recording's parts, each from a state estimated just before the scored samples.
 
-A simulation that is scored begins a *lead-in* early, with the state from which the model itself
-follows the lead-in best. The score then measures what a model predicts from what it has seen. No
-sample that is scored influences the start.
+A scored simulation begins one *lead-in* early, with the state from which the model itself follows
+the lead-in best. No scored sample influences this state, so the score measures the prediction from
+past samples only.
 """
 
 import logging
@@ -35,25 +35,25 @@ LEAD_IN = 0.2
 """Length of the lead-in [s].
 
 The slope at the end of a line through N positions that are rounded to counts has a standard
-deviation of a count over LEAD_IN sqrt(N): with 0.2 s at 500 Hz half a count a second, so that
-windows of 1 s show hardly more than the rounding. An acceleration that a model misses biases the
-velocity at the end by half of LEAD_IN times it, which adds a fifth of the model's own error to 1 s
-windows, and less to longer ones; a longer lead-in would add more.
+deviation of one count over LEAD_IN sqrt(N): with 0.2 s at 500 Hz half a count per second, so that
+the error of 1 s windows is hardly more than the rounding. An acceleration that a model lacks biases
+the velocity at the end by LEAD_IN / 2 times that acceleration, which adds a fifth of the model's
+own error to 1 s windows, and less to longer ones; a longer lead-in would add more.
 """
 ZERO_IN = 1.0
 """Time over which the zero of encoders that were zeroed for one recording is estimated [s].
 
-Gravity shows where a zero is, beside torques that the model misses. Those of friction change their
-sign with the velocity and cancel once the joints have turned both ways; over 0.2 s they do not.
+Gravity reveals the zero, but torques that the model lacks disturb it. Those of friction change sign
+with the velocity and cancel once the joints have turned both ways; over 0.2 s they do not.
 """
 FEWEST = 8  # samples
-# Friction that needs more integration steps to a sample than this is a wall: scoring it would take
-# minutes, and the search that found it has failed anyhow.
+# Friction that needs more integration steps per sample than this is practically a step: scoring it
+# would take minutes, and the search that found it has failed anyway.
 MOST_SUBSTEPS = 100
-# Starts drawn for the limit, each with noise of the torque. The true start is one more like them,
-# so that it errs by less than the worst of them in 39 of 40 cases.
+# Initial states drawn for the limit, each with noise of the torque. The true state is one more such
+# draw, so that its error is below the largest of theirs in 39 of 40 cases.
 DRAWS = 39
-# Samples of draws that are simulated together: a long recording of many takes much memory.
+# Samples simulated together, over all draws: many draws of a long recording take much memory.
 DRAWN_SAMPLES = 2**20
 # Filters of a controller's velocity and acceleration [Hz].
 CUTOFF = 20.0
@@ -62,9 +62,9 @@ STOP_STEP = 2e-4
 # Iterations of Gauss-Newton, and the change of the state, in standard deviations, that ends them.
 MOST_STEPS = 8
 SMALL = 0.05
-# Repetitions by which deviations that a lead-in contradicts are made smaller.
+# Iterations that shrink deviations which a lead-in contradicts.
 DRAWN_CLOSER = 3
-# Shares of a Gauss-Newton step that are tried; none of it where no other is better.
+# Fractions of a Gauss-Newton step to try; 0 if no other is better.
 SHARES = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
 
 
@@ -74,7 +74,7 @@ def lead_in_samples(recording: Recording) -> int:
 
 
 def longest_window(recording: Recording) -> float:
-    """Duration of the longest segment without a gap, its lead-in aside [s]."""
+    """Duration of the longest segment without a gap, excluding its lead-in [s]."""
     lead, time = lead_in_samples(recording), recording.time
     return max(
         float(time[last] - time[min(first + lead, last)]) for first, last in recording.segments
@@ -129,7 +129,7 @@ class Simulator:
         draws: int,
         zero: "Zero | None" = None,
     ) -> None:
-        """Check and prepare; the time that showed a `zero` of the recording is not scored."""
+        """Check and prepare; the time from which a `zero` was estimated is not scored."""
         if friction is not None:
             require_model(friction)
             if friction.joints != plant.joints:
@@ -141,7 +141,7 @@ class Simulator:
         self.scheme, self.draws = scheme, draws
         self.convention = recording.resolve_convention(plant)
         self.lead = lead_in_samples(recording)
-        # From zero, so that the rounding of large stamps costs no window its last sample.
+        # From zero, so that no window loses its last sample to the rounding of large time stamps.
         self.time = recording.time - recording.time[0]
         self.unscored = 0 if zero is None else int(np.searchsorted(self.time, ZERO_IN))
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
@@ -161,7 +161,7 @@ class Simulator:
             self.zeros = normal @ zero.root.T
         self.states: torch.Tensor | None = None
         self.law_states: torch.Tensor | None = None
-        # Those of a controller at every sample, from which windows go on.
+        # Hidden states as of a controller at every sample, from which windows continue.
         if friction is not None and (friction.state_size or friction.law.memory):
             motion = _causal_motion(plant, recording)
             q, qd, qdd = (torch.tensor(x) for x in (motion.q, motion.qd, motion.qdd))
@@ -192,7 +192,7 @@ class Simulator:
         return runs
 
     def windows(self, horizon: float) -> Runs | None:
-        """Runs over windows that follow each other, the first behind the first lead-in."""
+        """Runs over consecutive windows, the first after the first lead-in."""
         starts: list[int] = []
         length = len(self.time)
         for first, last in self.recording.segments:
@@ -200,8 +200,8 @@ class Simulator:
             if first >= last:
                 continue
             stamps = self.time[first : last + 1] - self.time[first]
-            # A stretch short of a whole number of windows by less than a twentieth of one, such as
-            # for its lead-in, still gives that number.
+            # A segment too short for a whole number of windows by less than a twentieth of one,
+            # such as because of its lead-in, still gives that number.
             count = int(stamps[-1] / horizon + 0.05)
             width = min(horizon, stamps[-1] / max(count, 1))
             edges = first + np.searchsorted(stamps, width * np.arange(count + 1) - 1e-9)
@@ -214,7 +214,7 @@ class Simulator:
     def _score(self, samples: NDArray[np.intp], state: Array | None = None) -> Runs:
         """Simulate windows of samples (window, sample), each beginning with its lead-in.
 
-        From a given state (1, 2 joint) all samples are scored but the first `unscored` seconds.
+        From a given state (1, 2 joint) all samples except the first `unscored` seconds are scored.
         """
         lead_in = samples[:, : self.lead]
         measured = self.recording.q[samples]
@@ -234,7 +234,7 @@ class Simulator:
             drawn, _ = self.simulate(state + off, samples, noise=k)
             apart = (self._as_read(drawn - zero[:, :, None], measured) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
-        # Noise of the measured position beside its rounding.
+        # Noise of the measured position in excess of its rounding.
         squares += np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
         if self.draws and np.isfinite(squares).all():
             finer, _ = self.simulate(state, samples, finer=2)
@@ -258,8 +258,8 @@ class Simulator:
             states: positions and velocities at the first samples, (*batch, window, 2 joint).
             samples: (window, sample).
             noise: seed of noise that is added to the torque, as large as the recorded one; None
-                for none.
-            finer: factor of the integration steps to a sample.
+                for no noise.
+            finer: factor on the number of integration steps per sample.
         """
         joints, first_link = self.plant.joints, self.plant.first_link
         if self.substeps is None:
@@ -300,8 +300,8 @@ class Zero:
     """Zero of a recording's encoders.
 
     Attributes:
-        offset: what to add to its positions, (joint,).
-        root: of its covariance root @ root.T by the noise of positions, (joint, joint).
+        offset: to be added to its positions, (joint,).
+        root: of its covariance root @ root.T due to position noise, (joint, joint).
     """
 
     offset: Array
@@ -316,9 +316,9 @@ def with_own_zero(
 ) -> tuple[Recording, tuple[Array, Array] | None, Zero | None]:
     """A recording and its initial state with its encoders' zero added, and that zero.
 
-    Of encoders that were set to zero at the start, at rest in a pose held by stiction; a recording
-    that begins otherwise, has a gap before `ZERO_IN`, or is too short to be scored behind that, is
-    as it is. Without a state it begins at rest.
+    For encoders that were set to zero at the start, at rest in a pose held by stiction. A recording
+    that begins otherwise, has a gap before `ZERO_IN`, or is too short to be scored after it, is
+    returned unchanged. Without a state it begins at rest.
     """
     if state is not None:
         _require_joints(plant, state)
@@ -356,12 +356,12 @@ def estimate_zero(
         if not all(np.isfinite(x).all() for x in (now, ahead, back)):
             break
         slopes = (ahead - back) / (0.2 * sd)
-        # The prior only keeps the zero of a joint that gravity does not load.
+        # The prior matters only for a joint that gravity does not load.
         weight = 1 / max(float(np.mean(now**2)), DEFAULTS.min_noise**2)
         data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
         prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
-        # By noise alone: errors of the zero that the model causes are its own.
+        # From noise alone: errors in the zero that the model causes count as the model's.
         noise = white_noise(torch.tensor(now)[None]).numpy().clip(DEFAULTS.min_noise)
         known = np.einsum("akj,bkj->ab", slopes / noise, slopes / noise)
         root = np.linalg.cholesky(np.linalg.inv(known + prior))
@@ -384,9 +384,9 @@ def estimate_starts(
 ) -> Starts:
     """States from which simulations follow the measured positions of lead-ins best.
 
-    Gauss-Newton on the squared errors, weighed by the sensor's noise, with the kinematic estimate
-    of a cubic through the lead-in as a weak prior: friction may stop a joint so soon that the
-    motion does not depend on its velocity.
+    Gauss-Newton on the squared errors, weighted by the sensor's noise, with the kinematic estimate
+    from a cubic through the lead-in as a weak prior, because friction may stop a joint so soon that
+    the motion does not depend on its velocity.
 
     Args:
         simulate: positions (*batch, window, sample, joint) from states (*batch, window, 2 joint).
@@ -402,7 +402,7 @@ def estimate_starts(
     distinct = (1 + np.count_nonzero(np.diff(y, axis=1), axis=1)) / count
     weight = distinct / noise**2
     kinematic, prior = _cubic(time, y, noise, distinct)
-    # Derivatives over steps of the noise's size see friction as the motion does.
+    # Finite differences over steps as large as the noise average friction as the motion does.
     nudge = noise[:, None, :] / np.stack([np.ones(len(y)), time[:, -1]], 1)[..., None]
     nudge = nudge.reshape(kinematic.shape)
     state, run = kinematic, simulate(kinematic)
@@ -424,7 +424,7 @@ def estimate_starts(
         state, run = trials[best], runs[best]
         if np.all(np.sum(gradient * step, axis=-1) < SMALL**2):
             break
-    # A model that misses the lead-in knows its state less well than the encoder would allow.
+    # A model that misfits the lead-in knows its state less well than the encoder would allow.
     misfit = np.nan_to_num(np.mean(((y - run) / noise[:, None]) ** 2, axis=(1, 2)), nan=1.0)
     excess = np.sqrt(np.maximum(misfit, 1.0))[:, None]
     root = np.linalg.cholesky(np.linalg.inv(information)) * excess[..., None]
@@ -432,7 +432,7 @@ def estimate_starts(
     deviations = (root @ normal[..., None])[..., 0]
     allowed = np.sum((excess * normal) ** 2, axis=-1)
     for _ in range(DRAWN_CLOSER if draws else 0):
-        # Where friction holds a joint, its derivatives vanish, and the covariance is too large.
+        # If friction holds a joint, the derivatives vanish, and the covariance is too large.
         apart = simulate(state + deviations) - run
         seen = np.einsum("swkj,wj->sw", np.nan_to_num(apart) ** 2, weight)
         deviations *= np.sqrt(allowed / np.maximum(seen, allowed))[..., None]
@@ -462,7 +462,7 @@ def _cubic(time: Array, y: Array, noise: Array, distinct: Array) -> tuple[Array,
     inverse = inverse[:, :2] / np.stack([np.ones_like(span), span], 1)
     precision = np.linalg.inv(inverse @ inverse.swapaxes(-1, -2))
     joints = y.shape[-1]
-    # Motion that is no cubic errs alike over all samples, unlike noise.
+    # Deviations of the motion from a cubic are correlated over all samples, unlike noise.
     by_joint = 1 / (noise**2 / distinct + y.shape[1] * np.maximum(misfit - noise**2, 0.0))
     whole = np.einsum("wab,wj,jk->wajbk", precision, by_joint, np.eye(joints))
     state = np.concatenate([coefficients[:, 0], coefficients[:, 1] / span], -1)
@@ -471,16 +471,16 @@ def _cubic(time: Array, y: Array, noise: Array, distinct: Array) -> tuple[Array,
 
 def _noise(y: Array, quantum: float | Array) -> Array:
     """Standard deviation of a measured position, (window, joint), at least the rounding error."""
-    # Fourth differences see noise, and of a smooth motion nothing; their weights squared sum to 70.
+    # Fourth differences show noise but no smooth motion; the squares of their weights sum to 70.
     seen = np.sqrt(np.mean(np.diff(y, n=4, axis=1) ** 2, axis=1) / 70)
-    # Joints that rest show none: theirs is that of the others.
+    # Joints at rest show none: they get that of the others.
     seen = np.where(seen > 0, seen, seen.max(axis=-1, keepdims=True))
     least = quantum / math.sqrt(12)
     return np.maximum(seen, np.maximum(least, 1e-12 * np.maximum(np.abs(y).max(axis=1), 1.0)))
 
 
 def _causal_motion(plant: Plant, recording: Recording) -> Motion:
-    """The motion in joint coordinates as a controller has it."""
+    """The motion in joint coordinates as a controller estimates it."""
     joint = recording.joint_coordinates(plant)
     quantum = plant.position_quantum or np.finfo(np.float64).eps
     cutoff = min(CUTOFF, 0.2 / joint.sample_time)
@@ -496,7 +496,7 @@ def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording
         needed = required_substeps(plant, friction, longest)
         if needed <= MOST_SUBSTEPS:
             return needed
-        found = f"needs {needed} integration steps to the longest sample of {longest:g} s"
+        found = f"needs {needed} integration steps in the longest sample of {longest:g} s"
     else:
         found = "has no finite slope"
     logger.warning(

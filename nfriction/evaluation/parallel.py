@@ -1,9 +1,9 @@
-"""Fit many models at the same time: an order that lets most run at once, in joblib's processes.
+"""Fit many models in parallel in joblib's processes, in an order that lets most run at once.
 
-Which processes is joblib's choice: its own on this machine, or those of a cluster where the caller
-says so, `with joblib.parallel_config(backend="dask"):`. Logs and warnings of a task come back with
-its result and are reported here, and every task has one thread wherever it runs, so the results do
-not depend on the number of processes.
+The processes are joblib's own on this machine, or those of a cluster if the caller chooses one with
+`with joblib.parallel_config(backend="dask"):`. Logs and warnings of a task are returned with its
+result and reported here. Every task has one thread wherever it runs, so that the results do not
+depend on the number of processes.
 """
 
 import logging
@@ -41,16 +41,16 @@ _PACKAGE = logging.getLogger("nfriction")
 
 
 class Progress:
-    """Receives what is being done; this one ignores it."""
+    """Receiver of progress reports; this one ignores them."""
 
     def expect(self, stages: int, *, brief: bool = False) -> None:
-        """So many further stages are to come; brief ones after all others."""
+        """Announce further stages; brief ones come after all others."""
 
     def stage(self, what: str) -> None:
-        """Begin a stage, or several at the same time."""
+        """Begin a stage; several may run at the same time."""
 
     def done(self) -> None:
-        """A stage has ended."""
+        """End a stage."""
 
     def step(self, stage: str) -> None:
         """Count a step of a search that runs in this process."""
@@ -64,7 +64,7 @@ class Data(NamedTuple):
 
 
 class Fits(NamedTuple):
-    """Fits by model, in the order asked for, and why a model has none."""
+    """Fits by model, in the requested order, and the reason if a model has none."""
 
     found: dict[str, FitResult]
     failed: dict[str, str]
@@ -103,7 +103,7 @@ def fit_models(
     for level in dependency_levels(origin):
         labels = {f"{part} {name}": (part, name) for part in parts for name in level}
         tasks = {
-            # An instance, as a process elsewhere may not know a law of one's own.
+            # An instance, because another process may not know a user's law.
             label: (
                 as_model(name, plant.joints, parts[part].motions), plant, parts[part],
                 results[part].found.get(origin[name] or ""), fit_settings,
@@ -123,7 +123,7 @@ def fit_models(
             logger.info("%s: %s (%.3g s)", label, result.status, seconds)
     if not any(of.found for of in results.values()):
         raise errors[0]
-    # Results came as they were finished.
+    # Results arrived in the order in which they were finished.
     return {
         part: Fits(
             {name: of.found[name] for name in names if name in of.found},
@@ -134,10 +134,10 @@ def fit_models(
 
 
 def warm_starts(models: Sequence[str]) -> dict[str, str | None]:
-    """The model from whose fit each begins, None for none.
+    """The model from whose fit each model starts, None for none.
 
-    Constant laws begin with the plant's terms of the first of them, all others with the constant
-    fit of their own law, or of the first where that is not asked for.
+    Constant laws start with the plant terms of the first of them; all other models with the
+    constant fit of their own law, or of the first if that is not requested.
     """
     kinds = {name: model_by_name(name) for name in models}
     constant = {n: k.definition for n, k in kinds.items() if issubclass(k, ConstantModel)}
@@ -150,7 +150,7 @@ def warm_starts(models: Sequence[str]) -> dict[str, str | None]:
 
 
 def dependency_levels(origin: Mapping[str, str | None]) -> Iterator[list[str]]:
-    """Names in groups: each begins from a fit of an earlier group, or from nothing."""
+    """Names in groups: each starts from a fit of an earlier group, or from none."""
     fitted: set[str | None] = {None}
     while len(fitted) <= len(origin):
         ready = [n for n, start in origin.items() if start in fitted and n not in fitted]
@@ -178,7 +178,7 @@ def _fit(
 def check_jobs(jobs: int) -> None:
     """Require at least one process, and joblib where there are several."""
     if not isinstance(jobs, Integral) or jobs == 0:
-        raise ValueError(f"`jobs` must be at least 1, or -1 for one to each core, got {jobs!r}.")
+        raise ValueError(f"`jobs` must be at least 1, or -1 for one per core, got {jobs!r}.")
     if jobs != 1:
         try:
             import joblib  # noqa: F401
@@ -195,12 +195,12 @@ def as_completed(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, T]]:
-    """Run independent tasks and yield label and result of each as it is finished.
+    """Run independent tasks and yield label and result of each when it is finished.
 
     Args:
         work: a function; for more than one process it must be importable by its name.
         tasks: its arguments by the label of each task.
-        jobs: number of processes; the tasks run in this one where it is 1, or there is one task.
+        jobs: number of processes; with 1, or a single task, the tasks run in this process.
         progress: receives the labels.
 
     Raises:
@@ -239,7 +239,7 @@ class TaskLog:
     warned: list[warnings.WarningMessage] = field(default_factory=list)
 
     def replay(self, shown: dict[Any, int]) -> None:
-        """Report them here; `shown` is the registry of warnings that were shown."""
+        """Report them in this process; `shown` is the registry of warnings already shown."""
         for record in self.records:
             logger = logging.getLogger(record.name)
             if logger.isEnabledFor(record.levelno):
@@ -251,7 +251,7 @@ class TaskLog:
 def _run(
     label: str, work: Callable[..., T], arguments: tuple[Any, ...], home: str, level: int
 ) -> tuple[str, T, TaskLog]:
-    """Run a task on one thread; `home` is the process that asks, `level` that of its logs."""
+    """Run a task on one thread; `home` is the calling process, `level` that of its logs."""
     log = TaskLog()
     with one_thread(), nullcontext() if home == _HERE else _capture_logs(log, level):
         try:
@@ -276,7 +276,7 @@ def one_thread() -> Iterator[None]:
 def _capture_logs(log: TaskLog, level: int) -> Iterator[None]:
     """Collect the log records of this thread and the warnings of the block."""
     queue: SimpleQueue[logging.LogRecord] = SimpleQueue()
-    # It puts records into a form that can be sent to another process.
+    # This handler converts records to a form that can be sent to another process.
     handler = logging.handlers.QueueHandler(queue)
     thread = threading.get_ident()
     handler.addFilter(lambda record: record.thread == thread)
@@ -298,7 +298,7 @@ def _capture_logs(log: TaskLog, level: int) -> Iterator[None]:
 def _ignore_sigint() -> Iterator[None]:
     """Child processes started here ignore Ctrl-C, which a terminal sends to all of them.
 
-    The parent terminates them; their solvers would take it for a wish to stop early.
+    The parent terminates them; their solvers would take it as a request to stop early.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is None or threading.current_thread() is not threading.main_thread():

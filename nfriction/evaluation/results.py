@@ -27,19 +27,19 @@ from nfriction.recording import Recording
 logger = logging.getLogger(__name__)
 
 RESULTS, TABLE, REPORT = "results.json", "table.csv", "report.html"
-# Files that a run may have written and a later one removes: in its own folders, no way out of them.
+# Files that a run writes and a later run may remove: only in its own folders, never outside them.
 OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.(png|svg|pdf|gif)")
 REPORT_MARK = b'<meta name="generator" content="nfriction'
 """Near the top of every report; a `report.html` without it is the user's own."""
-# In the folder while it is written: the lock, files that are not complete, files that are.
+# In the folder while it is written: the lock, incomplete files, complete files.
 LOCK, UNFINISHED, COMPLETE = ".nfriction.lock", ".nfriction-unfinished", ".nfriction-complete"
 EARLIER = "earlier.json"
-# Largest ratio of sample times that differ by the clocks of hosts, and not by what was set.
+# Largest ratio of sample times attributed to differing host clocks rather than to settings.
 CLOCKS = 1.05
 
 
 def digests(recordings: Sequence[Recording]) -> dict[str, str]:
-    """Digest of every recording by its name, and by its place too where that is not its own."""
+    """Digest of every recording by its name, and also by its place if the name is not unique."""
     names = [recording.name for recording in recordings]
     return {
         name if name and names.count(name) == 1 else f"{name or 'recording'} ({place})": r.digest()
@@ -48,14 +48,14 @@ def digests(recordings: Sequence[Recording]) -> dict[str, str]:
 
 
 def model_info(fit: FitResult, recordings: Sequence[Recording], run: str = "") -> ModelInfo:
-    """Entries of a model file that describe a fit to these recordings, in a run of that id."""
+    """Entries of a model file that describe a fit to these recordings, and the id of its run."""
     qd = np.concatenate([m.qd for m in fit.motions])
     qdd = np.concatenate([m.qdd for m in fit.motions])
     times = sorted(r.sample_time for r in recordings)
     return ModelInfo(
         joint_names=tuple(fit.plant.joint_names),
         unit=fit.plant.unit,
-        # Of several sample times, a controller's is not known.
+        # With several sample times, that of a controller is unknown.
         sample_time=times[len(times) // 2] if times[-1] <= CLOCKS * times[0] else None,
         input_ranges={
             "qd": np.stack([qd.min(0), qd.max(0)], -1).tolist(),
@@ -69,10 +69,9 @@ def model_info(fit: FitResult, recordings: Sequence[Recording], run: str = "") -
 
 @contextmanager
 def exclusive(folder: str | Path) -> Iterator[None]:
-    """Keep other processes from writing a run into this folder, which is made if need be.
+    """Keep other processes from writing a run into this folder, which is made if necessary.
 
-    First puts in order what a killed process left: complete files are put in place, others are
-    removed.
+    First cleans up after a killed process: complete files are put in place, others are removed.
 
     Raises:
         OSError: another process is writing it, or it cannot be written.
@@ -99,7 +98,7 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         if outermost:
             with suppress(OSError):
                 _put_in_place(folder)  # of a run that Ctrl-C ended here
-            # Windows removes it by itself, and refuses to as long as it is open.
+            # Windows removes the file by itself, and cannot while it is open.
             with suppress(OSError):
                 (folder / LOCK).unlink()
         lock.release()
@@ -118,16 +117,16 @@ def write_results(
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models with their TorchScript, and figures.
 
-    Every file bears the id of the run, and at no time does the folder hold files of two runs:
-    those of an earlier run, which its `results.json` lists, and its `report.html` are removed
-    before the first of this one is there; `results.json` comes last. The user's own files stay.
+    Every file contains the id of the run, and the folder never contains files of two runs: those of
+    an earlier run, which its `results.json` lists, and its `report.html` are removed before the
+    first file of this run appears; `results.json` comes last. The user's own files stay.
 
     Args:
         comparison: fits and scores.
         train, test: their recordings.
-        folder: made where it does not exist.
+        folder: made if it does not exist.
         selection: the choice on the training recordings alone, if there is one.
-        command: reproduces the results.
+        command: command line that reproduces the results.
         figures: draw them.
         formats: of figures besides PNG, see `plots.save_all`.
 
@@ -139,7 +138,7 @@ def write_results(
         "selection": None if selection is None else selection.to_dict(),
         "recordings": {"train": digests(train), "test": digests(test)},
     }
-    # Runs that come to the same results and parameters have the same files.
+    # Runs with equal results and parameters write equal files.
     parameters = {n: parameter_hash(f.model.state_dict()) for n, f in comparison.fits.items()}
     content = json.dumps([results, parameters], sort_keys=True)
     run = hashlib.sha256(content.encode()).hexdigest()[:16]
@@ -161,7 +160,7 @@ def write_results(
             write_index(unfinished, written)
             unfinished.rename(folder / COMPLETE)
             _put_in_place(folder)
-            # Drawn when the fits are safe: it takes long, and may be interrupted.
+            # Drawn after the fits are saved, because drawing takes long and may be interrupted.
             if figures:
                 from nfriction import plots  # matplotlib takes half a second that others save
 
@@ -169,7 +168,7 @@ def write_results(
                     comparison, [*train, *test], unfinished, run=run, formats=formats
                 )
                 (folder / "figures").mkdir(exist_ok=True)
-                # Listed before they are there, so that a later run knows them in any case.
+                # Listed before they are put in place, so that a later run knows them in any case.
                 written += [f"figures/{path.name}" for path in drawn]
                 write_index(folder, written)
                 for path in drawn:
@@ -182,7 +181,7 @@ def write_results(
 def files_of(index: Path) -> list[str]:
     """Files that an earlier run listed in its `results.json`, relative to its folder.
 
-    Only names that a run writes count, because the file may be anybody's.
+    Only names that a run can write count, because the file may be foreign.
     """
     try:
         content = json.loads(index.read_text(encoding="utf-8"))
@@ -194,7 +193,7 @@ def files_of(index: Path) -> list[str]:
 
 
 def report_of(folder: Path) -> Path | None:
-    """The folder's `report.html` if it is a report of ours."""
+    """The folder's `report.html` if nfriction wrote it."""
     path = folder / REPORT
     if not path.is_file():
         return None
@@ -205,8 +204,8 @@ def report_of(folder: Path) -> Path | None:
 def _put_in_place(folder: Path) -> None:
     """Replace the earlier run's files by the complete ones.
 
-    Killed at any point, it ends properly when called again: the earlier index moves away first
-    and is the list of files to remove, the new index comes last.
+    If this is killed at any point, another call completes it: the earlier index is moved first and
+    lists the files to remove, the new index comes last.
     """
     complete, index = folder / COMPLETE, folder / RESULTS
     earlier = complete / EARLIER
@@ -246,20 +245,20 @@ def _table(comparison: Comparison, run: str) -> str:
 
 
 def _plain_cell(name: str) -> str:
-    """A name that is valid Unicode, and that no spreadsheet will compute as a formula."""
-    # File names may hold bytes that are no UTF-8.
+    """A name in valid Unicode that no spreadsheet evaluates as a formula."""
+    # File names may contain bytes that are not UTF-8.
     text = name.encode(errors="backslashreplace").decode()
-    # Spreadsheets also take full-width signs, and skip white space before them.
+    # Spreadsheets also accept full-width signs, and skip white space before them.
     start = unicodedata.normalize("NFKC", text.lstrip())[:1]
     return f"'{text}" if start in tuple("=+-@") else text
 
 
 def _write_model(fit: FitResult, path: Path, info: ModelInfo) -> list[Path]:
-    """The model file and its TorchScript, where it has one."""
+    """Write the model file, and TorchScript if the model can be exported."""
     written = [save(fit.model, path, info)]
     try:
         written.append(torchscript(fit.model, path.with_suffix(".pt"), info))
-    # A ValueError of a law with memory that no controller can follow, or not at these sample times.
+    # ValueError: a law with memory that no controller can follow, or not at these sample times.
     except (ExportError, ValueError) as error:
         logger.warning("%s was not exported: %s", path.stem, " ".join(str(error).split()))
     return written

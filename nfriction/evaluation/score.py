@@ -1,10 +1,10 @@
 """Score a model: simulate a recording with it and measure the position error.
 
-A model that was fitted to some recordings is judged by others, simulated from nothing but their
-torques and a start: the state that it estimates from a short lead-in, which is not scored
+A model that was fitted to some recordings is tested on others. Its simulations use only their
+torques and an initial state, which the model estimates from a short lead-in that is not scored
 (`nfriction.evaluation.lead_in`). One simulation over the whole recording is the *free run*;
-*windows* are simulations of 1, 2 and 5 s, because a chaotic free run amplifies the error of its
-start more than that of the model. The next step is `nfriction.evaluation.compare`.
+*windows* are simulations of 1, 2 and 5 s, because a chaotic free run amplifies the error of the
+initial state more than that of the model. The next step is `nfriction.evaluation.compare`.
 """
 
 from collections.abc import Sequence
@@ -42,12 +42,12 @@ class RMSE:
         """From errors of shape (..., joint); NaN or infinity make it infinite."""
         with np.errstate(over="ignore", invalid="ignore"):
             square = np.mean(error.reshape(-1, error.shape[-1]) ** 2, axis=0)
-        # A motion that is lost must not look better than one that is merely bad.
+        # A diverged motion must not score better than one that is merely bad.
         square = np.where(np.isfinite(square), square, np.inf)
         return cls(tuple(float(x) for x in np.sqrt(square)), float(np.sqrt(square.mean())))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON; a diverged simulation has null for a number."""
+        """Plain JSON; null in place of a number if the simulation diverged."""
         values = [x if np.isfinite(x) else None for x in (*self.joints, self.all)]
         return {"joints": values[:-1], "all": values[-1]}
 
@@ -59,8 +59,8 @@ class Errors:
     Attributes:
         free_run: error of one simulation, from a given state or from a lead-in of 0.2 s; after a
             gap in time it restarts from another lead-in.
-        windows: error of simulations that follow each other, by horizon [s]; each starts from a
-            lead-in of its own.
+        windows: error of consecutive simulations, by horizon [s]; each starts from its own
+            lead-in.
     """
 
     free_run: RMSE
@@ -82,15 +82,15 @@ class Score(Errors):
     """Errors of one model on one recording; they are plain data, without plant or model.
 
     Attributes:
-        limit: errors by an uncertain start or zero of the encoders and by noise of the torque, in
-            simulations of this model; None where it was not asked for. The true model stays below
+        limit: errors caused by uncertain initial states and encoder zeros and by noise of the
+            torque, in simulations of this model; None if not requested. The true model stays below
             in at least 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
-        diverged_at: time at which the free run diverged [s], infinity where it did not. Friction
-            too steep at rest to be simulated at all counts as diverged from the start.
-        zero: what the model added to recorded positions as the zero of the encoders, (joint,).
+        diverged_at: time at which the free run diverged [s], infinity if it did not. Friction
+            too steep at rest to be simulated counts as diverged from the start.
+        zero: offset that the model added to recorded positions, the encoders' zero, (joint,).
     """
 
     limit: Errors | None
@@ -129,13 +129,13 @@ def score(
     Args:
         plant: the mechanism, its name, or the path of a rig file.
         friction: friction model, or None for no friction.
-        recording: or its path or table; the plant's angle convention applies where it has none.
+        recording: or its path or table; without an angle convention it has the plant's.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
-            taken as they are and scored from; by default estimated from a lead-in.
+            used unchanged and scored from the first sample; by default estimated from a lead-in.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
-        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to
-            rest off their balance, which a smoothed sign lets creep back.
-        limit: also find the limit of these data, by forty times as many simulations.
+        scheme: of the integration, see `rollout`; `"time_stepping"` if joints come to rest away
+            from their equilibrium, to which a smoothed sign lets them creep back.
+        limit: also find the limit of these data, which takes forty times as many simulations.
         zeroed: the encoders were set to zero at the start, at rest in a pose held by stiction; the
             model estimates their true zero from the first second, which is not scored.
 
@@ -177,7 +177,7 @@ def score(
 
 def _bound(runs: Sequence[Runs]) -> RMSE:
     """Largest error from all drawn starts, by joint and over all."""
-    # Runs count by their samples, so that a short stretch between gaps does not decide.
+    # Runs are weighted by their samples, so that a short stretch between gaps does not decide.
     weights = [run.error[..., 0].size for run in runs]
     squares = np.average([run.squares for run in runs], axis=0, weights=weights)
     squares = np.where(np.isfinite(squares), squares, np.inf)

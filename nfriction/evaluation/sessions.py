@@ -1,10 +1,10 @@
 """Friction over many sessions or units of one machine: the mean, and the spread between them.
 
-Every session is fitted by itself, so a thousand recordings need the memory of one a process. A
-random-effects model then combines the estimates: each session has friction of its own, drawn from
-a normal distribution whose mean and spread are estimated (Paule and Mandel 1982, J. Res. NBS 87,
-p. 377), and the interval for the next session contains both (Higgins, Thompson and Spiegelhalter
-2009, J. R. Stat. Soc. A 172, p. 137).
+Every session is fitted separately, so a thousand recordings need the memory of one per process. A
+random-effects model then combines the estimates: each session has its own friction, drawn from a
+normal distribution whose mean and spread are estimated (Paule and Mandel 1982, J. Res. NBS 87,
+p. 377), and the interval for the next session accounts for both (Higgins, Thompson and
+Spiegelhalter 2009, J. R. Stat. Soc. A 172, p. 137).
 """
 
 import copy
@@ -91,7 +91,7 @@ class SessionsResult:
     failed: Mapping[str, str]
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Table with a row a parameter."""
+        """Table with one row per parameter."""
         import pandas as pd  # slow to import
 
         return pd.DataFrame([vars(s) for s in self.spreads]).set_index("name")
@@ -113,7 +113,7 @@ def fit_sessions(
         plant: the mechanism as given, the same for all.
         sessions: recordings, or paths of recordings, by session: a day, a temperature, a unit. A
             path is read in the process that fits it, so memory does not grow with their number.
-        jobs: processes, -1 for one to each core; with `joblib.parallel_config(backend="dask")`
+        jobs: processes, -1 for one per core; with `joblib.parallel_config(backend="dask")`
             those of a cluster.
         progress: receives the labels.
         **fit_settings: as for `fit`.
@@ -170,12 +170,12 @@ def fit_sessions(
 def _fit_session(
     model: FrictionModel, plant: Plant, session: Session, settings: dict[str, Any]
 ) -> SessionFit | str:
-    """Estimates of a session, or the reason why there are none."""
+    """Estimates from a session, or the reason why there are none."""
     try:
         found = fit(copy.deepcopy(model), plant, session, **settings)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         return str(error)
-    # Motions and residuals stay behind: a thousand of them would fill the memory.
+    # Motions and residuals are not returned: a thousand of them would fill the memory.
     unknown = set(" with ".join(found.unidentifiable).split(" with "))
     return SessionFit(
         {i.name: i.value for i in found.intervals},
@@ -187,14 +187,14 @@ def _fit_session(
 
 
 def random_effects(name: str, values: Array, sd: Array) -> Spread:
-    """Mean and spread of estimates that have errors of their own.
+    """Mean and spread of estimates with known errors.
 
     The spread is the one at which the weighted squares of the deviations sum to their expectation,
     the number of estimates less one.
 
     Args:
         name: of the parameter.
-        values: an estimate a session.
+        values: one estimate per session.
         sd: its standard deviations; sessions with an infinite one do not count.
     """
     from scipy.optimize import brentq  # slow to import
@@ -206,7 +206,7 @@ def random_effects(name: str, values: Array, sd: Array) -> Spread:
     if count < 3:
         nan, inf = math.nan, math.inf
         return Spread(name, nan, nan, -inf, inf, -inf, inf, count)
-    # Estimates without an error, at a bound, would have all the weight.
+    # Estimates without an error, at a bound, would get all the weight.
     variance = np.maximum(variance, 1e-12 * max(float(variance.max()), np.finfo(float).tiny))
 
     def excess(between: float) -> float:

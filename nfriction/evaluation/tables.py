@@ -39,8 +39,8 @@ class Table:
         columns: headings; a comma separates a group of columns from the column's own name.
         rows: text and numbers.
         infinite: word for an infinite number.
-        marked: places of columns of which the least number is marked.
-        limit: a last row with differences that are not meaningful; empty where they are unknown.
+        marked: indices of columns whose smallest number is marked.
+        limit: a last row with the differences that are not meaningful; empty if unknown.
     """
 
     caption: str
@@ -51,7 +51,7 @@ class Table:
     limit: tuple[Value, ...] = ()
 
     def text(self, value: Value) -> str:
-        """A value as `four_digits` has it, infinite ones by the table's word."""
+        """A value as by `four_digits`, but the table's word for an infinite one."""
         infinite = isinstance(value, float) and math.isinf(value)
         return self.infinite if infinite else four_digits(value)
 
@@ -60,14 +60,14 @@ class Table:
         return column > 0 and not any(isinstance(row[column], str) for row in self.rows)
 
     def is_marked(self, row: Sequence[Value], column: int) -> bool:
-        """True where a marked column shows its least number, and that is finite."""
+        """True if the value is the smallest of a marked column, and finite."""
         if column not in self.marked:
             return False
         least = self._least(column)
         return math.isfinite(least) and self.text(row[column]) == self.text(least)
 
     def is_tied(self, row: Sequence[Value], column: int) -> bool:
-        """True where a marked column's least number has others within the limit, and row is one."""
+        """True if the value is within the limit of the smallest of a marked column."""
         if column not in self.marked or not self.limit:
             return False
         most = self._least(column) + float(self.limit[column])
@@ -100,7 +100,7 @@ class Table:
 
 
 def _room_for_marks(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Lines whose unmarked entries keep the place of a mark, so that digits are aligned."""
+    """Lines whose unmarked entries reserve space for a mark, so that digits are aligned."""
     marked = [any(value.endswith("=") for value in column) for column in zip(*lines, strict=True)]
     return [
         tuple(
@@ -150,14 +150,14 @@ def selection_table(selection: Selection) -> Table:
 def coefficient_table(
     model: str, joints: Sequence[str], sets: Sets, units: Mapping[str, str]
 ) -> Table:
-    """Coefficients by joint, and by where they apply if they follow the motion.
+    """Coefficients by joint, and by range of validity if they follow the motion.
 
     Joints are rows; many constants, as of a law with memory, are rows themselves.
 
     Args:
         model: its name.
         joints: names.
-        sets: by where they apply (`"always"` of constants), then by name: a value a joint.
+        sets: by range of validity (`"always"` for constants), then by name: one value per joint.
         units: by name of the coefficient, as far as they are known.
     """
     names = list(next(iter(sets.values()), {}))

@@ -78,9 +78,9 @@ class TorqueFits:
 
     Attributes:
         table: the rows.
-        fits: of every model by name, one a joint in the table's order.
+        fits: by name of the model, one per joint in the table's order.
         candidates: errors on blocks left out, by joint: root mean square torque [N m; N].
-        choices: model to use and why, by joint.
+        choices: model to use and the reason, by joint.
         failed: models that could not be fitted, with the reason.
     """
 
@@ -119,7 +119,7 @@ class TorqueFits:
         return known
 
     def _names(self, model: str | None) -> list[str]:
-        """The model of each joint: a given one, or those chosen."""
+        """The model of each joint: the given one, or the chosen ones."""
         if model is None:
             return list(self.chosen.values())
         return [self._known(model)] * len(self.table.joints)
@@ -158,11 +158,11 @@ class TorqueFits:
         )
 
     def predict(self, table: Any, model: str | None = None) -> list[Array]:
-        """Friction torque at the rows of another table, an array (row,) a joint [N m; N].
+        """Friction torque at the rows of another table, one array (row,) per joint [N m; N].
 
         Args:
             table: a `TorqueTable`, a path or a DataFrame, with the joints of the training table.
-                Without torque, laws with memory begin without deflection.
+                Without torque, laws with memory start undeflected.
             model: by either of its names; by default the one chosen at each joint.
 
         Raises:
@@ -189,9 +189,9 @@ class TorqueFits:
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("joint")
 
     def intervals(self, name: str | None = None) -> pd.DataFrame:
-        """Coefficients of a model, by default of those chosen: value, low and high of 95 %.
+        """Coefficients of a model, by default of the chosen ones, with 95 % intervals.
 
-        Slip elements and terms that were not chosen are left out.
+        Slip elements and terms that were not selected are left out.
         """
         import pandas as pd  # slow to import
 
@@ -211,7 +211,7 @@ class TorqueFits:
                     label = f"{symbol} of {joint}"
                     i = known.get(label)
                     note = "not identifiable" if label in unknown else ""
-                    # Ends that nothing bounds are left blank.
+                    # Unbounded ends are left blank.
                     ends = (i.low, i.high) if i else (math.nan, math.nan)
                     low, high = (x if math.isfinite(x) else math.nan for x in ends)
                     label += "" if where == "always" else f", {where.replace('_', ' ')}"
@@ -220,7 +220,7 @@ class TorqueFits:
         return pd.DataFrame(rows, columns=columns).set_index("parameter")
 
     def _head(self) -> str:
-        """The choice at each joint with its error, in a line each."""
+        """The choice for each joint with its error, one line each."""
         lines = []
         for joint, (name, why) in self.choices.items():
             error = float(self.to_frame()[name][joint])
@@ -279,25 +279,25 @@ def fit_torque(
 ) -> TorqueFits:
     """Fit friction models to a table of friction torque over velocity, joint by joint.
 
-    For constant-velocity tests, and for the residual torque of any inverse dynamics. Constant
-    coefficients come from least squares within bounds, a network from a search under its prior,
-    which is kept where it lowers the error on blocks left out. Models are compared on these blocks,
-    contiguous in time; rows without time are dealt to the blocks by their velocity. Laws with
-    memory follow rows in order of time; the first 0.2 s of a table show how they were deflected
-    before, and are not scored.
+    For constant-velocity tests, and for residual torques of any inverse dynamics. Constant
+    coefficients come from least squares within bounds, a network from a search under its prior;
+    the network is kept if it lowers the error on hold-out blocks. Models are compared on these
+    blocks, contiguous in time; rows without time are assigned to blocks by their velocity. Laws
+    with memory need rows in order of time; their initial deflection is estimated from the first 0.2
+    s of a table, which are not scored.
 
     Args:
         table: a `TorqueTable`, or a path or DataFrame that makes one.
-        models: names, with commas between them or in a list; by default all constant laws that
-            the table's columns allow.
-        folds: blocks that are left out in turn, at least 2.
+        models: names, comma-separated or in a list; by default all constant laws that the table's
+            columns allow.
+        folds: number of hold-out blocks, at least 2.
         options: tuning constants.
         progress: called with each stage.
         reading: `columns`, `degrees` and `unit`, see `TorqueTable.from_pandas`.
 
     Raises:
-        ValueError: a column that is missing, a joint that does not move, too few rows, or no model
-            that could be fitted; the message names the remedy.
+        ValueError: a missing column, a joint that does not move, too few rows, or no model that
+            could be fitted; the message names the remedy.
     """
     given = as_table(table, **reading)
     time = all(joint.time is not None for joint in given.joints)
@@ -318,7 +318,7 @@ def fit_torque(
             progress(f"fit {plain_name(name)}")
         try:
             found = [_fit(name, joint, v_smooth, folds, options) for joint in given.joints]
-        # One law that does not suit the table must not lose the others.
+        # A law that does not suit the table must not prevent the others.
         except ValueError as error:
             failed[name] = str(error)
             continue
@@ -335,11 +335,11 @@ def fit_torque(
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
-    """The model to use and why.
+    """The model to use and the reason.
 
-    A law that needs memory, or a load, has to be better than the choice among those that need less
-    by more than chance explains over the blocks, by the rules for networks and for their inputs:
-    what is particular to one run of few strokes is not seen again in the next.
+    A law that needs memory, or a load, has to beat the choice among laws that need less by more
+    than chance explains over the blocks, by the rules for networks and for their inputs, because
+    peculiarities of one run with few strokes do not recur in the next.
     """
     by_need: dict[tuple[bool, bool], list[Candidate]] = {}  # memory, load
     for candidate in candidates:
@@ -371,7 +371,7 @@ def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
     """The model with fewest parameters whose error is within a tolerance of the least, and why."""
     least = min(candidates, key=lambda c: c.error)
     near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
-    # Of a law and its network that was dropped, equal but for rounding, the law.
+    # A dropped network equals its law but for rounding: then the law.
     chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:
         number = "fewer" if chosen.parameters < least.parameters else "no more"
@@ -391,7 +391,7 @@ def _fit(
     """A model fitted to all rows of a joint, and its errors on blocks left out."""
     model = model_by_name(name)(1)
     form = model.schedule.form
-    # Of fewer rows each is left out once.
+    # With fewer rows than folds, each row is left out once.
     folds = min(folds, len(joint))
     if model.law.memory is not None:
         fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
@@ -402,7 +402,7 @@ def _fit(
             "its law, or its neuro-fuzzy model."
         )
     require_load(name, joint)
-    # No network first: it is kept only where it lowers the error.
+    # The law without a network first: a network is kept only if it lowers the error.
     shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
@@ -413,12 +413,12 @@ def _fit(
             found = fit_network(constant, rest, share, options) if share else constant
             error = predict(found.model, left) - torch.as_tensor(left.tau)
             errors[i, k] = float(error.square().mean().sqrt())
-    # Squares, as blocks of equal length then weigh as one table would.
+    # Mean squares, so that blocks of equal length count as one table would.
     best = int(np.square(errors).mean(1).argmin())
     found = fit_joint(name, joint, v_smooth, options)
     if shares[best]:
         found = fit_network(found, joint, shares[best], options)
-    # A network that was dropped has no parameters beyond its law's.
+    # A dropped network has no parameters beyond its law's.
     count = int((found.model.schedule.parameter_vector() != 0).sum())
     count += len(found.model.law.coefficients) * (form != "constant")
     return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
@@ -427,19 +427,19 @@ def _fit(
 def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     """Error of the torque that a model of one joint predicts at the rows of a joint.
 
-    The lead-in of a law with memory is not scored, because its torque was read. A ripple that is
-    out of phase with the rows is logged.
+    The lead-in of a law with memory is not scored, because the model was given its torque. A ripple
+    that is out of phase with the rows is logged.
     """
     torque, rows = predict(model, joint).numpy(), slice(None)
     if joint.time is not None and model.law.memory is not None:
-        # Scoring them would reward reading the answer.
+        # The initial deflection was estimated from the torque of these rows.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
     if isinstance(model.schedule, Recorded) and "ripple" in model.schedule.followed():
         shift = ripple_shift(model.schedule, joint, torque, blocks(joint, FOLDS))
         if shift:
             logger.warning(
-                "%s: the ripple over the position is out of phase with this table, as with another "
-                "zero of the encoder; add %.4g to its positions, or take slip.", joint.name, shift,
+                "%s: the ripple over the position is out of phase with this table, probably by "
+                "another encoder zero; add %.4g to its positions, or use slip.", joint.name, shift,
             )  # fmt: skip
     rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
     nrmse = rmse / (float(joint.tau[rows].std()) or math.nan)
@@ -457,7 +457,7 @@ class SavedModel(NamedTuple):
 def read_models(path: str | Path) -> list[SavedModel]:
     """Models by joint, from a model file or from a folder that `write_torque_fits` wrote.
 
-    Of a folder each joint has the model that was chosen for it.
+    From a folder, each joint gets the model that was chosen for it.
 
     Raises:
         ValueError: it is neither, or damaged.
@@ -471,7 +471,7 @@ def read_models(path: str | Path) -> list[SavedModel]:
         chosen = {str(joint): model_name(of["model"]) for joint, of in content["chosen"].items()}
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{path} is no folder that fit-torque wrote: {index.name} is missing or another's."
+            f"{path} is no folder written by fit-torque: {index.name} is missing or not its own."
         ) from error
     by_name = {
         name: {one.joint: one for one in _saved(path / "models" / f"{name}.json")}
@@ -504,7 +504,7 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
 
 
 def split(model: FrictionModel) -> list[FrictionModel]:
-    """One model a joint from a model of many joints."""
+    """Models of one joint each from a model of many joints."""
     state = model.state_dict()
     make: Any = type(model)
     found = []
@@ -518,7 +518,7 @@ def split(model: FrictionModel) -> list[FrictionModel]:
 def _check_joints(names: Sequence[str], table: TorqueTable) -> None:
     if tuple(names) != table.joint_names:
         raise ValueError(
-            f"the model is of {', '.join(names)}, the table of {', '.join(table.joint_names)}; "
+            f"the model has joints {', '.join(names)}, the table {', '.join(table.joint_names)}; "
             "give a table of the same joints in the same order."
         )
 

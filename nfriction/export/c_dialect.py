@@ -1,7 +1,7 @@
-"""C89 that is C++ as well: literals, tables, templates, and scalar nodes as expressions.
+"""C89 that is also C++: literals, tables, templates, and scalar nodes as expressions.
 
 Values used once are written where they are used, the others become constants of the function.
-The text depends on the graph alone, so the same model gives the same bytes.
+The text depends only on the graph, so the same model gives the same bytes.
 """
 
 import math
@@ -19,7 +19,7 @@ from nfriction.codegen.scalar import Node, is_predicate, reachable
 
 Real = Literal["double", "float"]
 
-# Functions of C89's math.h; others, and all in single precision, came with C99.
+# Functions of C89's math.h; others, and all single-precision ones, came with C99.
 _C89 = frozenset(
     ("acos", "asin", "atan", "atan2", "ceil", "cos", "cosh", "exp", "fabs", "floor", "fmod", "log",
      "pow", "sin", "sinh", "sqrt", "tan", "tanh")
@@ -31,7 +31,7 @@ _LARGEST = {"double": float(np.finfo(np.float64).max), "float": float(np.finfo(n
 _HELPERS = {
     "nf_max": ("REAL a, REAL b", "a > b ? a : b"),
     "nf_min": ("REAL a, REAL b", "a < b ? a : b"),
-    # By a comparison: fabsf came with C99, and compilers of C89 would call it.
+    # With a comparison, because fabsf came with C99 but compilers of C89 would call it.
     "nf_abs": ("REAL a", "a > -a ? a : -a"),
     "nf_clamp": ("REAL x, REAL low, REAL high", "x < low ? low : x > high ? high : x"),
     "nf_square": ("REAL a", "a * a"),
@@ -47,13 +47,13 @@ class ControllerC:
     templates: tuple[str, ...] = ("nfriction.export", "templates")  # package, folders in it
 
     def literal(self, value: float | bool) -> str:
-        """A number as C spells it, in brackets where it is negative."""
+        """A number in C, in brackets if it is negative."""
         if isinstance(value, bool):
             return "1" if value else "0"
         if math.isnan(value):
             raise ValueError("NaN among the numbers of a model; check its parameters.")
-        # C89 has no infinity. Emitted code sees finite numbers only, on which comparisons with
-        # the largest one come out the same.
+        # C89 has no infinity. Emitted code gets only finite numbers, for which comparisons with
+        # the largest one have the same result.
         largest = _LARGEST[self.real]
         value = min(max(float(value), -largest), largest)
         single = self.real == "float"
@@ -108,7 +108,7 @@ class ControllerC:
         return re.sub(r"\bNF_", f"{self.prefix.upper()}_", text)
 
     def functions(self, text: str) -> str:
-        """Prototypes that C89 lacks and helpers, as far as `text` calls them."""
+        """Prototypes that C89 lacks, and helpers, if `text` calls them."""
         single = bool(self.suffix)
         called = set(re.findall(r"\b(\w+)\(", text))
         late = [
@@ -149,7 +149,7 @@ def _templates(dialect: ControllerC) -> jinja2.Environment:
 
 
 def _filled(parts: Sequence[str], width: int, pad: str) -> str:
-    """Parts with commas between them, as many a line as fit."""
+    """Parts with commas between them, as many per line as fit."""
     lines: list[str] = []
     for part in parts:
         fits = bool(lines) and "\n" not in part and "\n" not in lines[-1]
@@ -161,14 +161,14 @@ def _filled(parts: Sequence[str], width: int, pad: str) -> str:
 
 
 def comment(text: str) -> str:
-    """Foreign text for the inside of a C comment: it can neither end it nor continue a line."""
+    """Untrusted text for a C comment, which it can neither end nor continue over a line."""
     # Question marks could be trigraphs, of which one is a backslash.
     plain = "".join(c if " " <= c <= "~" and c not in "?\\" else "." for c in text)
     return plain.replace("*/", "* /").replace("/*", "/ *")
 
 
 def is_identifier(name: str) -> bool:
-    """True for a name of C that is no keyword."""
+    """True for a C identifier that is not a keyword."""
     return re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name) is not None and name not in _TAKEN
 
 
@@ -184,7 +184,7 @@ _TAKEN_WORDS = """
 """
 _TAKEN = frozenset(re.findall(r"\w+", _TAKEN_WORDS))
 
-_INLINE = 64  # characters; longer single-use values get a line of their own
+_INLINE = 64  # characters; longer single-use values get their own line
 
 # How tightly an operator binds; an atom or a call binds tightest.
 ATOM, _UNARY, _PRODUCT, _SUM, _COMPARE, _NOT, _AND, _OR = 9, 8, 7, 6, 5, 4, 3, 2
@@ -205,7 +205,7 @@ def statements(
 ) -> tuple[list[str], list[str]]:
     """Definitions of local values, and one expression per output.
 
-    `bound` has the text of nodes that are at hand (inputs, hoisted values), by node number.
+    `bound` has the text of available nodes (inputs, hoisted values), by node number.
     """
     nodes = reachable(outputs, [n for n in reachable(outputs) if n.number in bound])
     uses: dict[int, int] = {}
@@ -242,7 +242,7 @@ def statements(
 def expression(
     op: str, operands: Sequence[tuple[str, int]], dialect: ControllerC
 ) -> tuple[str, int]:
-    """Text of an operation, and how tightly it binds, of operands given likewise."""
+    """Text of an operation and its binding strength, from those of its operands."""
 
     def operand(i: int, binding: int) -> str:
         text, own = operands[i]

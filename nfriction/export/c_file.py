@@ -1,4 +1,4 @@
-"""C for controllers: one source file and its header, a self-test, and skeletons around them."""
+"""C for controllers: one source file with its header, a self-test, and skeletons for hosts."""
 
 import ctypes
 import os
@@ -29,7 +29,7 @@ from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
 from nfriction.plant.rigs import from_dict
 
-# How much more a controller may err that rounds motions between filter and model.
+# Factor on the tolerance of a controller that rounds motions between filter and model.
 ROUNDED = 5.0
 REALS: dict[str, Real] = {"float64": "double", "float32": "float"}
 
@@ -47,26 +47,26 @@ def c(
 ) -> list[Path]:
     """Write a model as C for controllers.
 
-    The C is C89 and C++ alike, allocates nothing, has no globals that change, and calls nothing
-    but `exp`, `tanh` and their like, in its own precision. The models' formulas are written to be
-    read, over tables of their parameters; a neuro-fuzzy joint takes about 2.3 kB on a Cortex-M4F.
-    A schedule of one's own is written out as it computes.
+    The code is valid C89 and C++, allocates no memory, has no mutable globals, and calls only
+    functions such as `exp` and `tanh`, in its own precision. The models' formulas are readable and
+    use tables of parameters; a neuro-fuzzy joint takes about 2.3 kB on a Cortex-M4F. A user's own
+    schedule is written as its traced operations.
 
     Args:
         model: a friction model.
-        folder: where to write; made if missing. The same model gives the same bytes.
+        folder: to write into; made if missing. The same model gives the same bytes.
         info: description of the model besides its parameters. With its rig, C of a law that reads
             the load has a function `<name>_load(q, qd, load)` for it.
         dtype: "float64" or "float32", in which the controller computes.
-        name: of the files, and prefix of all functions, types and macros: controllers of
-            different names link into one program.
-        with_filter: write the causal filter from raw positions too.
+        name: of the files, and prefix of all functions, types and macros: controllers with
+            different names can be linked into one program.
+        with_filter: include the causal filter from raw positions.
         torque_limit, cutoff_hz: see `controller_of`.
 
     Returns:
-        What was written: `<name>.c` and `<name>.h`; `<name>.contract.json` with the metadata
-        and test vectors; `<name>_selftest.c`, a program that returns 0 where these agree;
-        `<name>.hpp` for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
+        Files written: `<name>.c` and `<name>.h`; `<name>.contract.json` with the metadata and
+        test vectors; `<name>_selftest.c`, a program that returns 0 if the outputs agree with
+        these; `<name>.hpp` for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form.
@@ -125,7 +125,7 @@ def _vectors(contract: Contract, dialect: ControllerC) -> dict[str, str]:
     tau, coefficients, status = (
         torch.nan_to_num(contract.outputs[key], 0.0) for key in ("tau_f", "coefficients", "status")
     )
-    # What the filter gives is rounded to single precision on its way to the model.
+    # The output of the filter is rounded to single precision before it reaches the model.
     rounded = dialect.real == "float" and contract.description["filter"] is not None
     tolerance = (ROUNDED if rounded else 1.0) * contract.tolerance
     tables += [
@@ -150,7 +150,7 @@ def _table(name: str, values: Tensor, dialect: ControllerC, kind: str = "") -> s
     return f"static const {kind or dialect.real} {name}[{count}][{columns}] = {{\n{rows}\n}};\n"
 
 
-# As controllers are built; standard, since fast-math is the user's own choice.
+# Usual flags for controllers; standard-conforming, because fast-math is the user's choice.
 FLAGS = ("-std=c89", "-O2")
 LARGEST_FILE = 256 * 2**20
 
@@ -169,21 +169,21 @@ def beside(source: str | Path) -> Path:
 
 
 def c_contract(source: str | Path) -> Contract:
-    """Read the contract that lies beside an exported C file, which must be named as it was."""
+    """Read the contract in the folder of an exported C file, which must have its original name."""
     source, metadata = Path(source), beside(source)
     if not metadata.is_file():
-        raise ContractError(f"{source}: its metadata, {metadata.name}, do not lie beside it.")
+        raise ContractError(f"{source}: its metadata, {metadata.name}, are not in the same folder.")
     if max(source.stat().st_size, metadata.stat().st_size) > LARGEST_FILE:
-        raise ExportError(f"{source}: too large for a controller of nfriction.")
+        raise ExportError(f"{source}: too large for a controller from nfriction.")
     if not is_identifier(source.stem):
         raise ContractError(
-            f"{source}: the file is named as its functions are; give it its old name."
+            f"{source}: the file must have the name of its functions; restore its original name."
         )
     return Contract.from_json(metadata.read_text("utf-8"))
 
 
 def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., tuple[Any, ...]]:
-    """Compile an exported C file; returns how to run it, see `verify`."""
+    """Compile an exported C file; return a function that runs it, see `verify`."""
     source = Path(source)
     description = c_contract(source).description
     joints, count = int(description["joints"]), len(description["coefficients"])
@@ -208,8 +208,8 @@ def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., 
 def _library(source: Path, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:
     compiler = find_compiler()
     if compiler is None:
-        raise ExportError("no C compiler (CC, cc, gcc, clang) was found to run the C with.")
-    # Behind a filter the first motion is that of a joint at rest.
+        raise ExportError("no C compiler (CC, cc, gcc, clang) was found to build the C code.")
+    # After a filter the first motion is that of a joint at rest.
     first = "t, t" if filters else "x[0], x[1]"
     text = ControllerC(prefix=source.stem).text("rows.c", name=source.stem, first=first)
     with tempfile.TemporaryDirectory(prefix="nfriction-") as folder:
@@ -218,8 +218,8 @@ def _library(source: Path, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:
         parts, library = driver.with_suffix(".o"), driver.with_suffix(".so")
         compiling = [*compiler, *flags, "-fPIC", f"-I{source.resolve().parent}", "-c", "-o",
                      str(parts), str(driver)]  # fmt: skip
-        # Linked without the flags: with -ffast-math gcc would add code that has the whole process
-        # flush small numbers to zero as soon as the library is loaded.
+        # Linked without the flags: with -ffast-math gcc would add code that makes the whole process
+        # flush small numbers to zero once the library is loaded.
         for command in (compiling, [*compiler, "-shared", "-o", str(library), str(parts), "-lm"]):
             result = subprocess.run(command, capture_output=True, text=True, check=False)
             if result.returncode:

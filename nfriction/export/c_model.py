@@ -1,4 +1,4 @@
-"""The C of a controller: templates filled with a model's tables and with its law, emitted."""
+"""C code of a controller: templates filled with a model's tables and its generated law."""
 
 import math
 import re
@@ -19,9 +19,9 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant
 
-# An exponential that compilers vectorise: that of `math.h` is a call for every number, this one a
-# loop over an array without branches or tables.
-# Of (exp(r) - 1) / r for |r| <= ln(2) / 2, minimax: exp(r) to 4e-18 and 2e-9, beside roundings.
+# An exponential that compilers vectorise: `math.h` needs a call for every number, this one is a
+# loop over an array without branches or tables. Minimax polynomial of (exp(r) - 1) / r for |r| <=
+# ln(2) / 2: exp(r) to 4e-18 and 2e-9, plus round-off.
 _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "double": (1.0, 0.5000000000000012, 0.16666666666666222, 0.0416666666665181,
                0.008333333333548278, 0.0013888888946297076, 0.0001984126943904723,
@@ -30,13 +30,13 @@ _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "float": (1.0, 0.49999994, 0.16666432, 0.041667998, 0.008374143, 0.0013843952),
 }  # fmt: skip
 
-# ln 2 as a number of few bits, whose products with whole numbers are exact, and the rest.
+# ln 2 as a number with few bits, whose products with whole numbers are exact, and the remainder.
 _LN2: dict[Real, tuple[float, float]] = {
     "double": (0.693145751953125, 1.4286068203094173e-06),
     "float": (0.693359375, -0.00021219444),
 }
 
-# Shift of a set that is there for its place alone: its membership is zero.
+# Shift of a padding set, whose membership is zero.
 _NOWHERE = 1e3
 
 
@@ -49,7 +49,7 @@ def source_of(
 ) -> tuple[str, str]:
     """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
 
-    With a plant, and a law that reads the load, they have a function of the plant's load.
+    With a plant and a law that reads the load, they contain a function for the plant's load.
     """
     if dialect.real == "float":
         controller = for_single_precision(controller)
@@ -64,7 +64,7 @@ def source_of(
         and any(_depends(x, "load") for x in _traced_law(controller.model, 1).outputs[0].nodes),
         "bits": description["status_bits"],
         "drive_torques": [] if plant is None else plant.torque_offset.tolist(),
-        # Names and units are foreign text.
+        # Names and units are untrusted text.
         "about": description,
         "safe": lambda text: comment(str(text)).rstrip(),
     }
@@ -84,7 +84,7 @@ def source_of(
 
 
 def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
-    """Words of the controller's template beside its sizes."""
+    """Words of the controller's template in addition to its sizes."""
     model: FrictionModel = controller.model
     # A subclass computes as it likes: only the class that names its form itself has that form.
     form = vars(type(model.schedule)).get("form", "traced")
@@ -163,10 +163,9 @@ def _add_network(
 def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
     """Scales folded into slopes, shifts and weights.
 
-    Inputs are brought to [-1, 1] by `gain x + shift`; sets and units are those of such inputs, with
-    exponents -(slope x + shift)^2. The head's bias is part of the consequents, half the
-    coefficients' scale of all weights and of the reference; the units of the head see its inputs in
-    that scale.
+    Inputs are scaled to [-1, 1] by `gain x + shift`; sets and units refer to these, with exponents
+    -(slope x + shift)^2. The head's bias is included in the consequents, and half the coefficients'
+    scale in all weights and in the reference; the units of the head take its inputs in that scale.
 
     Returns:
         `rate` (joint,); `gain` and `shift` (joint, input); `set_slope` and `set_shift` (joint,
@@ -229,7 +228,7 @@ _DEEP = 40.0
 
 def _deepest(slope: Tensor, shift: Tensor) -> float:
     """Largest exponent (slope x + shift)^2 of the nearest set, over inputs of -1 to 1."""
-    # It lies at an end of the range, or where two sets are alike.
+    # It lies at an end of the range, or where two sets have equal membership.
     meetings = [
         (sign * shift[..., :, None] - shift[..., None, :])
         / (slope[..., None, :] - sign * slope[..., :, None])
@@ -286,7 +285,7 @@ def _law(
 
 
 def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
-    """True where the law of all joints is that of one, joint by joint."""
+    """True if the law of all joints is that of one joint, repeated."""
     generator = np.random.default_rng(0)
     points = {p.name: generator.uniform(0.1, 2.0, (8, joints, len(p.nodes))) for p in one.inputs}
     alone = evaluate(one.outputs[0].nodes, points)[0]
@@ -323,7 +322,7 @@ def _load(plant: Plant, dialect: ControllerC) -> str:
 
 
 def _schedule(controller: Controller, dialect: ControllerC) -> str:
-    """Functions of the coefficients of a schedule of whatever kind, written out for all joints."""
+    """Functions of the coefficients of any schedule, written out for all joints."""
     schedule, joints = controller.model.schedule, controller.joints
     motion = {"qd": _example(joints), "qdd": _example(joints)}
 
@@ -380,12 +379,12 @@ def _braces(lines: Sequence[str], indent: str) -> str:
 
 
 def _example(*size: int) -> Tensor:
-    # All different, so that nothing looks alike by chance.
+    # All different, so that nothing is equal by chance.
     return torch.linspace(0.5, 1.5, math.prod(size), dtype=torch.float64).reshape(size)
 
 
 def exponential(dialect: ControllerC, joints: int, signs: int) -> str:
-    """Write `nf_exp`, and `nf_tanh` where there are `signs` numbers a joint to take it of."""
+    """Write `nf_exp`, and `nf_tanh` if it is needed for `signs` numbers per joint."""
     return dialect.text(
         "exponential.c", joints=joints, signs=signs, ln2=_LN2[dialect.real],
         polynomial=_by_pairs(dialect), spare=lambda count: _spare(count, dialect),
@@ -393,16 +392,16 @@ def exponential(dialect: ControllerC, joints: int, signs: int) -> str:
 
 
 def _spare(count: int, dialect: ControllerC) -> str:
-    """Spell the numbers by which an array is longer, so that exponentials vectorise by four.
+    """The padding of an array that lets exponentials vectorise by four.
 
-    At -O2 gcc vectorises only where it knows that no numbers remain. Single precision is for
+    At -O2 gcc vectorises only if it knows that no numbers remain. Single precision is for
     microcontrollers, which have no vectors.
     """
     return f" + {-count % 4}" if dialect.real == "double" and count % 4 else ""
 
 
 def _by_pairs(dialect: ControllerC) -> str:
-    """The polynomial in r by pairs of terms, of s = r^2: half as long a chain as Horner's."""
+    """The polynomial in r by pairs of terms in s = r^2: half as long a chain as Horner's."""
     texts = [dialect.literal(x) for x in _POLYNOMIAL[dialect.real]]
     pairs = [
         f"({texts[i]} + r * {texts[i + 1]})" if i + 1 < len(texts) else texts[i]

@@ -22,9 +22,9 @@ from nfriction.io.model_file import ModelInfo, describe
 
 Series = tuple[Tensor, ...]
 
-# How far beyond the trained range targets are compared.
+# Share of the trained range by which comparisons exceed it.
 BEYOND = 0.1
-# Range of a joint for which nobody gave one.
+# Range of a joint without a given one.
 DEFAULT_RANGE = {"qd": 20.0, "qdd": 200.0}
 LARGEST_LOAD = 3.0
 
@@ -42,16 +42,16 @@ def ranges(controller: Controller) -> dict[str, Tensor]:
 
 
 def draw(controller: Controller, count: int, seed: int = 0) -> Series:
-    """Finite inputs to 10 % beyond the trained range, (sample, joint) each.
+    """Finite inputs up to 10 % beyond the trained range, (sample, joint) each.
 
-    Motions are drawn by `draw_motion`; positions are those of a swing, in successive samples.
+    Motions are drawn by `draw_motion`; positions are consecutive samples of a swing.
     """
     qd, qdd, load = draw_motion(controller, count, seed)
     return (_sweep(controller, count), load) if controller.filters else (qd, qdd, load)
 
 
 def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
-    """Velocity, acceleration and load, evenly drawn; a third of the velocities near rest."""
+    """Velocity, acceleration and load, drawn uniformly; a third of the velocities near rest."""
     generator = torch.Generator().manual_seed(seed)
 
     def even(low: Tensor, high: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
     # A transmitted torque has a sign.
     load = even(zero - LARGEST_LOAD * controller.loaded, zero + LARGEST_LOAD)
     qd, qdd = (even(*_widened(edges)) for edges in ranges(controller).values())
-    # Near rest the sign turns and the acceleration along the motion with it.
+    # Near rest the sign changes, and with it the acceleration along the motion.
     qd[::3] *= 10.0 ** even(zero - 5.0, zero)[::3]
     return qd, qdd, load
 
@@ -70,7 +70,7 @@ def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
 def trials(controller: Controller) -> Series:
     """The inputs of the test vectors: drawn ones, then edges, rest, and broken inputs.
 
-    Broken inputs come last, one joint and one input at a time, with a sound sample after each.
+    Non-finite inputs come last, one joint and one input at a time, each followed by a valid sample.
     """
     drawn = draw(controller, 200, seed=6)
     if not controller.filters:
@@ -80,7 +80,7 @@ def trials(controller: Controller) -> Series:
 
 
 def _widened(edges: Tensor) -> tuple[Tensor, Tensor]:
-    """Range of every joint with a tenth of it more on either side."""
+    """Range of every joint, extended by a tenth on either side."""
     low, high = edges.unbind(-1)
     more = BEYOND * (high - low)
     return low - more, high + more
@@ -92,7 +92,7 @@ def _sweep(controller: Controller, count: int) -> Tensor:
     cutoff_hz, sample_time = (controller.filter_options[k] for k in ("cutoff_hz", "sample_time"))
     _, fastest = _widened(ranges(controller)["qd"])
     time = sample_time * torch.arange(count, dtype=torch.float64)[:, None]
-    # Below the cut-off, so that it gets through, and in two swings or more to the longest count.
+    # Below the cut-off, so that it passes the filter, and with at least two swings in all.
     rate = math.tau * min(0.2 * cutoff_hz, 8.0 / (count * sample_time))
     phase = torch.arange(controller.joints, dtype=torch.float64)
     growth = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None]
@@ -100,7 +100,7 @@ def _sweep(controller: Controller, count: int) -> Tensor:
 
 
 def _special(controller: Controller) -> Series:
-    """Every pair of edges of the range, rest, and creeping."""
+    """All pairs of edges of the range, rest, and creeping."""
     found = ranges(controller)
     levels = {}
     for name, edges in found.items():
@@ -116,7 +116,7 @@ def _special(controller: Controller) -> Series:
 
 
 def _with_broken(inputs: Series, joints: int) -> Series:
-    """The inputs, followed by every kind of broken one, each among sound ones."""
+    """The inputs, followed by every kind of non-finite one, each between valid ones."""
     kinds = (math.nan, math.inf, -math.inf)
     rounds = 2 * max(joints, 2) * len(kinds) * len(inputs)
     rows = torch.arange(rounds) % len(inputs[0])
@@ -130,7 +130,7 @@ def _with_broken(inputs: Series, joints: int) -> Series:
 
 
 class ExportError(RuntimeError):
-    """An artefact could not be made, or does not equal its model."""
+    """An artefact could not be made, or differs from its model."""
 
 
 def first_line(error: Exception) -> str:
@@ -140,13 +140,13 @@ def first_line(error: Exception) -> str:
 
 
 class ContractError(ValueError):
-    """Metadata of an artefact are absent, damaged or not ours."""
+    """Metadata of an artefact are missing, damaged or not from nfriction."""
 
 
 FORMAT, SCHEMA = "nfriction controller", 1
 # Largest torque error over full scale that a target in double, or in single precision, may show.
 TOLERANCE = {"float64": 1e-12, "float32": 5e-7}
-# Coefficients come out of longer sums than the torque, some of them small differences.
+# Coefficients result from longer sums than the torque, some of them small differences.
 COEFFICIENT_SLACK = 20.0
 OUTPUTS = ("tau_f", "coefficients", "status")
 MOST_VECTORS, MOST_STATES = 100_000, 1000
@@ -162,9 +162,9 @@ class Parity:
         points: samples compared.
         torque_error: largest |difference| of the torque over the joint's full scale, which is the
             largest |torque| or that of `Contract.scales`.
-        coefficient_error: the same of the coefficients, over the full scale of each.
-        edges: samples whose status, or whose NaN, are not those of the model.
-        tolerance: largest torque error allowed; the coefficients have 20 times that.
+        coefficient_error: the same for the coefficients, over the full scale of each.
+        edges: samples whose status or NaN differ from those of the model.
+        tolerance: largest torque error allowed; 20 times that for the coefficients.
     """
 
     points: int
@@ -175,7 +175,7 @@ class Parity:
 
     @property
     def passed(self) -> bool:
-        """True where all of it is within tolerance."""
+        """True if all differences are within tolerance."""
         return (
             self.points > 0
             and self.torque_error <= self.tolerance
@@ -199,11 +199,11 @@ class Contract:
         description: model, joint names in order, units, sample time, input ranges, hashes of
             parameters and training data, versions; plain JSON.
         inputs: test vectors by name of the input, each (vector, joint). Where the controller has a
-            state they are successive samples, the first one on `initial_state`.
-        outputs: `tau_f`, `coefficients` and `status` that the model gives.
+            state they are consecutive samples, the first one on `initial_state`.
+        outputs: `tau_f`, `coefficients` and `status` from the model.
         scales: full scale of `tau_f`, (joint,), and of `coefficients`, (coefficient,): the largest
-            value in the outputs or, where it is a small difference of large numbers, as much as
-            its rounding errors call for.
+            value in the outputs, or more if that is a small difference of large numbers with
+            large rounding errors.
         tolerance: largest torque error over full scale that an artefact may show [-].
     """
 
@@ -215,7 +215,7 @@ class Contract:
 
     @property
     def state_size(self) -> int:
-        """Numbers a joint that the controller carries from sample to sample."""
+        """Numbers per joint that the controller carries from sample to sample."""
         return int(self.description["state_size"])
 
     def require_dtype(self, dtype: str) -> None:
@@ -251,7 +251,7 @@ class Contract:
         try:
             content = parse_json(text)
         except (ValueError, RecursionError) as error:
-            raise ContractError(f"the metadata are no JSON, or cut short ({error}).") from error
+            raise ContractError(f"the metadata are not JSON, or cut short ({error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ContractError("the metadata are not those of a controller of nfriction.")
         if content.get("schema") != SCHEMA:
@@ -272,7 +272,7 @@ class Contract:
             reason = first_line(error)
             raise ContractError(f"the test vectors are missing or damaged ({reason}).") from error
         size, dtype = content.get("state_size"), content.get("dtype")
-        sound = type(size) is int and 0 <= size <= MOST_STATES  # true is no size
+        sound = type(size) is int and 0 <= size <= MOST_STATES  # True is not a size
         if not sound or str(dtype) not in TOLERANCE or content.get("inputs") != list(inputs):
             raise ContractError("the metadata lack inputs, type or size of the state.")
         outputs["status"] = outputs["status"].to(torch.int32)
@@ -289,25 +289,25 @@ def contract_of(
     """Make the contract of a controller, with its test vectors.
 
     Args:
-        model, info: that the controller was made of.
-        controller: what is exported.
+        model, info: from which the controller was made.
+        controller: to be exported.
         dtype: "float64" or "float32", in which the target computes.
 
     Raises:
-        ValueError: for another dtype, or if the joints' names are not one a joint.
+        ValueError: for another dtype, or if there is not one name per joint.
     """
     if dtype not in TOLERANCE:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     info = info or ModelInfo()
     inputs = trials(controller)
     if dtype == "float32":
-        # As the target will be given them: at the edges of the range a rounding decides the status.
+        # As the target gets them, because rounding decides the status at the edges of the range.
         inputs = tuple(x.float().double() for x in inputs)
     outputs = controller.run(*inputs)
     beyond = "of clamped inputs" if controller.clamps else "as the model has them there"
     description = {
         **describe(model, info),
-        # Of a law with memory its state is given out, too.
+        # For a law with memory its state is also listed.
         "coefficients": describe(controller.model, info)["coefficients"],
         # A hidden state advances by it, also where nobody gave one.
         "sample_time": info.sample_time or getattr(model.schedule, "sample_time", None),
@@ -321,11 +321,11 @@ def contract_of(
         "filter": controller.filter_options,
         "status_bits": {"outside": OUTSIDE, "not_finite": NOT_FINITE, "saturated": SATURATED},
         "edges": {
-            "outside_input_ranges": f"coefficients {beyond}; the law goes on",
-            "not_finite": "NaN torque and coefficients of that joint; its state stays",
+            "outside_input_ranges": f"coefficients {beyond}; the law continues",
+            "not_finite": "NaN torque and coefficients of that joint; its state is unchanged",
         },
     }
-    # Once through JSON, so that tuples are lists here as they are for a reader.
+    # Through JSON, so that tuples become lists, as for a reader.
     description = json.loads(json.dumps(description, allow_nan=False))
     return Contract(
         description,
@@ -350,13 +350,13 @@ def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tens
     single = copy.deepcopy(model).float()
     qd, qdd, load = (x.float().double() for x in draw_motion(controller, 20_000, seed=7))
     seen = controller.seen(qd, qdd)[:2]
-    # The same memory for both: a rounding must not put a sample into another class.
+    # The same memory for both, because rounding must not put a sample into another class.
     motion = (*seen, model.schedule.initial_state(*seen))
     exact = model.schedule.coefficients_from(*motion)
     try:
         rounded = single.schedule.coefficients_from(*(x.float() for x in motion))
         torque = single.torque(qd.float(), load.float(), rounded)
-    except RuntimeError:  # a schedule of one's own that computes in double alone
+    except RuntimeError:  # a user's schedule that supports only double precision
         return scales
     pairs = ((torque, model.torque(qd, load, exact), 1.0), (rounded, exact, COEFFICIENT_SLACK))
     for (name, scale), (found, expected, slack) in zip(scales.items(), pairs, strict=True):
@@ -366,10 +366,10 @@ def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tens
 
 
 def verify(run: Runner, contract: Contract) -> Parity:
-    """Run an artefact over the contract's test vectors.
+    """Run an artefact on the contract's test vectors.
 
-    `run` takes the inputs in their order, each a float64 tensor (vector, joint), and gives torque,
-    coefficients and status of all, in order from the initial state where there is one.
+    `run` takes the inputs in their order, each a float64 tensor (vector, joint), and returns
+    torque, coefficients and status of all, in order from the initial state if there is one.
     """
     found = run(*contract.inputs.values())
     return compare(tuple(contract.outputs.values()), found, contract.tolerance, contract.scales)
@@ -432,14 +432,14 @@ def write_verified(
 
 
 def _plain(values: Any) -> Any:
-    """Nested lists of numbers, with strings for those that JSON does not know."""
+    """Nested lists of numbers, with strings for those that JSON lacks."""
     if isinstance(values, list):
         return [_plain(value) for value in values]
     return values if math.isfinite(values) else str(values)
 
 
 def _tensor(name: str, given: Any) -> Tensor:
-    """A tensor of nested lists as `_plain` spells them."""
+    """A tensor from nested lists as written by `_plain`."""
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
     values = numbers(name, given, words=("nan", "inf", "-inf"))

@@ -1,12 +1,12 @@
-"""Controllers: a friction model under the one contract of its edges.
+"""Controllers: a friction model under one contract for its edge cases.
 
     finite inputs      torque and coefficients of the model
-    outside the range  coefficients as the schedule has them there, the law goes on; OUTSIDE
-    NaN or infinity    NaN torque and coefficients of that joint, the others as ever; NOT_FINITE
+    outside the range  coefficients from the schedule, the law continues; OUTSIDE
+    NaN or infinity    NaN torque and coefficients of that joint, the others unaffected; NOT_FINITE
     beyond a limit     torque at the limit; SATURATED
 
-Schedules that handle their range themselves see all finite inputs: neuro-fuzzy ones return to their
-constant law beyond it. Others see inputs clamped to `ModelInfo.input_ranges`. OUTSIDE always means:
+Schedules that handle their range themselves get all finite inputs: neuro-fuzzy ones return to their
+constant law beyond it. Others get inputs clamped to `ModelInfo.input_ranges`. OUTSIDE always means
 outside `input_ranges`.
 """
 
@@ -28,9 +28,9 @@ from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.
 OUTSIDE, NOT_FINITE, SATURATED = 1, 2, 4
-# Edge of a range that nobody gave; the largest float, so that targets of single precision know it.
+# Edge of an unspecified range: the largest float in single precision, so that all targets have it.
 UNBOUNDED = float(torch.finfo(torch.float32).max)
-# Numbers a joint that the causal filter carries: last position, last velocity, two by low-pass.
+# State of the causal filter per joint: last position, last velocity, two numbers per low-pass.
 FILTER_STATE = 6
 
 
@@ -45,10 +45,10 @@ def controller_of(
     """Make the controller that every target exports.
 
     Args:
-        model: a friction model; a frozen copy is taken, in float64 on the CPU.
-        info: the trained ranges, and the sample time that a filter needs.
-        torque_limit: largest |torque| given out [N m], a number or one a joint.
-        with_filter: take raw positions, with the causal filter inside.
+        model: a friction model; the controller uses a frozen copy, in float64 on the CPU.
+        info: the training ranges, and the sample time that a filter needs.
+        torque_limit: limit of the |torque| [N m], one number or one per joint.
+        with_filter: take raw positions and filter them causally.
         cutoff_hz: cut-off of that filter [Hz].
 
     Raises:
@@ -61,18 +61,18 @@ def controller_of(
         if info.sample_time is None:
             raise ValueError(
                 f"the law {model.law.name!r} has memory, which a controller advances by "
-                "`ModelInfo.sample_time` [s], got None."
+                "`ModelInfo.sample_time` [s], but it is None."
             )
         model = sampled(model, info.sample_time)
-    if info.sample_time is not None and isinstance(model.schedule, Heated):
+    if info.sample_time is not None and isinstance(schedule := model.schedule, Heated):
         model = copy.deepcopy(model)
-        model.schedule = model.schedule.at_sample_time(info.sample_time)
+        model.schedule = schedule.at_sample_time(info.sample_time)
     if not with_filter:
         return Controller(model, info, torque_limit)
     if info.sample_time is None:
         raise ValueError(
-            "a filter needs `ModelInfo.sample_time` [s], got None: none was given, or the model "
-            "was fitted to recordings of different ones."
+            "a filter needs `ModelInfo.sample_time` [s], but it is None: none was given, or the "
+            "model was fitted to recordings with different ones."
         )
     low_pass = SecondOrderLowPass(numbers("cutoff_hz", cutoff_hz), float(info.sample_time))
     return Controller(model, info, torque_limit, low_pass)
@@ -81,12 +81,12 @@ def controller_of(
 class Controller(nn.Module):
     """Friction torque, coefficients and status of one sample after another.
 
-    `controller(*inputs)` gives torque, coefficients and status; where the controller has a state,
-    `controller(*inputs, state)` gives the next state too. Inputs are velocity, acceleration and
-    load, or position and load with the filter inside: velocity is then the difference of the
-    position through a causal second-order low-pass filter, acceleration the difference of that
-    velocity through the same filter again. An input that is not finite leaves the state of its
-    joint as it was, a load only where it moves the state.
+    `controller(*inputs)` gives torque, coefficients and status; if the controller has a state,
+    `controller(*inputs, state)` also gives the next state. Inputs are velocity, acceleration and
+    load, or with the filter position and load: velocity is then the difference of the position
+    through a causal second-order low-pass filter, acceleration the difference of that velocity
+    through the same filter again. An input that is not finite leaves the state of its joint
+    unchanged, a load only if the state depends on it.
 
     Args:
         model, info, torque_limit: see `controller_of`.
@@ -98,7 +98,7 @@ class Controller(nn.Module):
 
     Attributes:
         inputs: names of the inputs.
-        state_size: numbers a joint that it carries from sample to sample; those of the filter come
+        state_size: numbers per joint that it carries from sample to sample, those of the filter
             before those of the schedule.
         memory_size: those of the schedule alone.
 
@@ -112,7 +112,7 @@ class Controller(nn.Module):
     qdd_upper: Tensor
     torque_limit: Tensor
 
-    # Constants by which TorchScript compiles the branches that are taken, and no others.
+    # Constants, so that TorchScript compiles only the branches that are taken.
     clamps: Final[bool]
     limited: Final[bool]
     remembers: Final[bool]
@@ -154,7 +154,7 @@ class Controller(nn.Module):
 
     @torch.jit.unused
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-        """Torque [N m], coefficients, status and, where there is one, the next state."""
+        """Torque [N m], coefficients, status and, if there is one, the next state."""
         if self.filters:
             return self.filtered_step(*given)
         if self.remembers:
@@ -184,7 +184,7 @@ class Controller(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Torque, coefficients, status and next memory at velocity, acceleration and load.
 
-        Without a memory, whatever is given for it is handed back.
+        Without a memory, the given value is returned unchanged.
         """
         qd_seen, qdd_seen, outside = self.seen(qd, qdd)
         motion = qd.abs() + qdd.abs()
@@ -199,10 +199,10 @@ class Controller(nn.Module):
         status = outside.to(torch.int32)
         if self.limited:
             held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit)
-            # SATURATED; TorchScript takes no global.
+            # SATURATED; TorchScript does not accept globals.
             status = status + 4 * (held != tau_f).to(torch.int32)
             tau_f = held
-        # The comparisons are false for NaN as for infinity.
+        # The comparisons are false for NaN and for infinity.
         finite = (motion + load.abs() < math.inf) & (tau_f.abs() < math.inf)
         return (
             torch.where(finite, tau_f, math.nan),
@@ -226,7 +226,7 @@ class Controller(nn.Module):
         return tau_f, coefficients, status, following
 
     def initial_memory(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Memory before a first sample; a joint that is not finite counts as one at rest."""
+        """Memory before a first sample; a joint with non-finite inputs counts as at rest."""
         finite = qd.abs() + qdd.abs() < math.inf
         qd_seen, qdd_seen, _ = self.seen(
             torch.where(finite, qd, 0.0), torch.where(finite, qdd, 0.0)
@@ -243,7 +243,7 @@ class Controller(nn.Module):
         return state
 
     def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
-        """The torque alone, by the same contract; a memory is that after a first sample."""
+        """The torque alone, under the same contract; a memory is that after a first sample."""
         qd_seen, qdd_seen, _ = self.seen(qd, qdd)
         if self.loaded:
             start = self.model.schedule.initial_state(qd_seen, qdd_seen)
@@ -253,12 +253,12 @@ class Controller(nn.Module):
             coefficients = self.model.schedule(qd_seen, qdd_seen)
         tau_f = self.model.torque(qd, load, coefficients)
         held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
-        # Zero times what is not finite is NaN: a third of the operations of comparisons.
+        # Zero times a non-finite number is NaN: a third of the operations of comparisons.
         held = torch.addcmul(held, qd, qdd, value=0.0)
         return torch.addcmul(held, load, tau_f, value=0.0)
 
     def seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Velocity and acceleration that the schedule sees, and whether they leave the range."""
+        """Velocity and acceleration for the schedule, and whether they leave the range."""
         if qd.size(-1) != self.joints:
             raise ValueError(
                 f"inputs must be (*batch, joint) with {self.joints} joints, got last axis "
@@ -292,7 +292,7 @@ def run_in_order(
 
 
 def for_single_precision(controller: Controller) -> Controller:
-    """With ranges such that no number in single precision changes its side by their rounding."""
+    """The controller with ranges whose rounding to single precision moves no input across them."""
     single = copy.deepcopy(controller)
     for name in ("qd", "qdd"):
         for edge, inward in (("lower", math.inf), ("upper", -math.inf)):

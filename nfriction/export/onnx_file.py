@@ -1,8 +1,8 @@
-"""ONNX: a graph for ONNX Runtime and its kin, in double or single precision.
+"""ONNX: a graph for ONNX Runtime and similar hosts, in double or single precision.
 
-torch's own exporter writes Python numbers as float32 and leaves `Atan` in double, for which ONNX
-Runtime has no kernel; either costs a controller its parity. Whatever depends on parameters alone is
-computed here and written as a constant.
+torch's own exporter writes Python numbers as float32, which costs a controller its parity, and
+`Atan` in double, for which ONNX Runtime has no kernel. Here everything that depends only on
+parameters is computed beforehand and written as a constant.
 """
 
 import importlib
@@ -30,21 +30,21 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.version import __version__
 
-# Old enough for runtimes in the field; nothing newer is needed.
+# Old enough for runtimes in use; nothing newer is needed.
 OPSET, IR_VERSION = 18, 8
 LARGEST_FILE = 256 * 2**20
 REAL = {"float64": np.float64, "float32": np.float32}
 
 
 class Value(NamedTuple):
-    """A value known at run time only: its name in the graph and its type in torch."""
+    """A value known only at run time: its name in the graph and its type in torch."""
 
     name: str
     dtype: torch.dtype
 
 
 class Unknown(int):
-    """The size of the batch, known at run time only; -1 as `view` spells it."""
+    """The size of the batch, known only at run time; -1 as in `view`."""
 
 
 class OnnxGraph:
@@ -84,14 +84,14 @@ class OnnxGraph:
     def emit(
         self, op: str, *operands: Any, dtype: torch.dtype | None = None, **attributes: Any
     ) -> Value:
-        """Add a node, by default of its first operand's type; constants may be given as such."""
+        """Add a node, by default of its first operand's type; operands may be constants."""
         like = next(x.dtype for x in operands if isinstance(x, (Value, Tensor)))
         value = Value(f"v{len(self.nodes)}", dtype or like)
         self._node(op, [self.name(x, like) for x in operands], value.name, **attributes)
         return value
 
     def name(self, x: Any, like: torch.dtype = torch.float64) -> str:
-        """The name of a value, or of the constant that holds a tensor or number."""
+        """The name of a value, or of the constant for a tensor or number."""
         if isinstance(x, Value):
             return x.name
         tensor = x.detach() if isinstance(x, Tensor) else torch.tensor(x, dtype=like)
@@ -109,7 +109,7 @@ class OnnxGraph:
         self.nodes.append(self.helper.make_node(op, inputs, [output], **attributes))
 
     def _call(self, node: Any, values: dict[Any, Any]) -> Any:
-        """Result of a node of the program: a value, or a tensor where all is known."""
+        """Result of a node of the program: a value, or a tensor if all operands are known."""
         args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: values[n])
         if not any(isinstance(values[n], (Value, Unknown)) for n in node.all_input_nodes):
             return node.target(*args, **kwargs)
@@ -187,17 +187,17 @@ def _pad_last(g: OnnxGraph, a: Value, pads: Sequence[int], value: float = 0.0) -
 
 def _view(g: OnnxGraph, a: Any, size: Sequence[int]) -> Value:
     if sum(n == -1 for n in size) > 1:
-        raise ExportError("a view with two sizes that are known at run time has no ONNX form here.")
+        raise ExportError("a view with two sizes known only at run time has no ONNX form here.")
     return g.emit("Reshape", a, _integers(*size))
 
 
 def _atan(g: OnnxGraph, x: Value) -> Value:
-    """ONNX Runtime has Atan in single precision only; one Newton step makes it double."""
+    """Arctangent: ONNX Runtime has it in single precision; one Newton step makes it double."""
     if g.real == np.float32:
         return g.emit("Atan", x)
     single = g.emit("Atan", g.emit("Cast", x, to=1))
     y = g.emit("Cast", single, dtype=torch.float64, to=11)
-    # With s = sin y and c = cos y this is tan(arctan(x) - y), of which the arctangent is itself.
+    # With s = sin y and c = cos y this is tan(arctan(x) - y), so small that it is its arctangent.
     s, c = g.emit("Sin", y), g.emit("Sin", g.emit("Add", y, 0.5 * math.pi))
     tangent = g.emit(
         "Div",
@@ -267,14 +267,14 @@ def onnx(
     """Write a model as ONNX, with a batch of any size.
 
     Inputs `qd`, `qdd`, `load`, outputs `tau_f`, `coefficients`, `status`, all (batch, joint) in SI.
-    Where the controller has a state, it is the input `state` and the output `next_state`, (batch,
-    joint, number); one that is NaN is a fresh start. The metadata (see `Contract`) are JSON under
-    `nfriction.json` in `metadata_props`. The file is run and compared with the model before it
-    takes its place, by ONNX Runtime where that is installed, else by ONNX's own evaluator.
+    If the controller has a state, it is the input `state` and the output `next_state`, (batch,
+    joint, number); a state of NaN is a fresh start. The metadata (see `Contract`) are JSON under
+    `nfriction.json` in `metadata_props`. The file is run and compared with the model before it is
+    put in place, with ONNX Runtime if that is installed, else with ONNX's own evaluator.
 
     Args:
-        dtype: "float64" or "float32", of inputs, outputs and all between.
-        others: as of `torchscript`; the file is by custom `.onnx`.
+        dtype: "float64" or "float32", for inputs, outputs and all intermediate values.
+        others: as for `torchscript`; the file is usually `.onnx`.
 
     Returns:
         The path.
@@ -286,7 +286,9 @@ def onnx(
     _package()
     if dtype == "float32" and with_filter:
         # Differences of positions over a millisecond have half the digits of the positions.
-        raise ValueError('the filter needs dtype="float64"; or filter outside, in double.')
+        raise ValueError(
+            'the filter needs dtype="float64"; or filter externally, in double precision.'
+        )
     controller = controller_of(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
@@ -310,7 +312,7 @@ def contract_of_onnx(path: str | Path) -> Contract:
 
 
 def onnx_runner(path: str | Path, controller: Controller) -> Runner:
-    """Load an artefact; its graph must be that of the controller, its numbers need not be."""
+    """Load an artefact with the controller's graph; its numbers may differ."""
     file = _read(path)
     dtype = _dtype(file)
     if _without_numbers(file) != _without_numbers(_file(controller, dtype)):
@@ -324,7 +326,7 @@ def _dtype(file: Any) -> str:
 
 
 def _without_numbers(file: Any) -> bytes:
-    """Bytes of all that a file computes, with the sizes of its constants alone."""
+    """Bytes of the computation in a file, with only the sizes of its constants."""
     bare = type(file)()
     bare.CopyFrom(file)
     bare.ClearField("metadata_props")
@@ -355,7 +357,7 @@ def _read(path: str | Path) -> Any:
     try:
         return package.load_model_from_string(Path(path).read_bytes())
     except (broken, ValueError, RuntimeError) as error:
-        raise ExportError(f"{path}: no ONNX graph ({first_line(error)}).") from error
+        raise ExportError(f"{path} is no ONNX graph ({first_line(error)}).") from error
 
 
 def _package() -> Any:
@@ -370,7 +372,7 @@ def _package() -> Any:
 
 
 def _file(controller: Controller, dtype: str) -> Any:
-    """The whole file but for its metadata, as a protocol buffer."""
+    """The whole file except its metadata, as a protocol buffer."""
     package = _package()
     helper = package.helper
     inputs, outputs = list(controller.inputs), list(OUTPUTS)

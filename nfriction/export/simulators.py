@@ -1,8 +1,8 @@
-"""MJCF and URDF: the nearest damping and friction loss of a simulator's joints, and the error.
+"""MJCF and URDF: the closest damping and friction loss of a simulator's joints, and the error.
 
-Simulators know `damping * qd + frictionloss * sgn(qd)`. Of all such pairs the one that comes
-closest along a real motion is written, beside the residual torque error. MuJoCo also has LuGre's
-friction, as a part of its motors, so that LuGre and Dahl are written as they are.
+Simulators model `damping * qd + frictionloss * sgn(qd)`. The pair that comes closest along a real
+motion is written, with its residual torque error. MuJoCo also has LuGre friction, as part of its
+motors, so that LuGre and Dahl are exported exactly.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,17 +27,17 @@ Load = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class DampingFit:
-    """Damping and friction loss nearest to a model.
+    """Damping and friction loss closest to a model.
 
     Attributes:
         joint_names: in the order of the joints.
         damping: [N m s/rad], (joint,).
         frictionloss: [N m], (joint,).
         rms_torque: of the model along the motion [N m], (joint,).
-        rms_error: of the torque by these two numbers [N m], (joint,).
+        rms_error: of the torque with these two numbers [N m], (joint,).
         unit: of a joint's position, "rad" or "m".
-        lugre: stiffness, damping, Coulomb and static friction of bristles and Stribeck's velocity,
-            in MuJoCo's order, (joint, 5); empty where damping and friction loss are all.
+        lugre: stiffness, damping, Coulomb and static friction of bristles and Stribeck velocity,
+            in MuJoCo's order, (joint, 5); empty without LuGre friction.
     """
 
     joint_names: tuple[str, ...]
@@ -82,17 +82,17 @@ def fit_damping_frictionloss(
     load: Load | None = None,
     info: ModelInfo | None = None,
 ) -> DampingFit:
-    """Fit damping and friction loss to a model along a motion, by least squares over its samples.
+    """Fit damping and friction loss to a model by least squares over the samples of a motion.
 
     Args:
         model: a friction model.
         motions: in joint coordinates; every sample has the same weight.
-        load: normal load at positions and velocities (sample, joint), as `Plant.load`; 1 if not
-            given.
+        load: normal load at positions and velocities (sample, joint), such as `Plant.load`; 1 by
+            default.
         info: names and unit of the joints.
 
     Raises:
-        ValueError: if the motion is not one of the model's joints, or stands still.
+        ValueError: if the motion has other joints than the model, or none of it moves.
     """
     parts = [motions] if isinstance(motions, Motion) else list(motions)
     torques = [_torque(model, part, load) for part in parts]
@@ -123,23 +123,23 @@ def mjcf(
 ) -> DampingFit:
     """Write a model as `damping` and `frictionloss` of MuJoCo's joints.
 
-    Constant LuGre and Dahl friction becomes damping, and a motor without input on each joint, whose
-    `lugre` is the friction (MuJoCo 4.0).
+    Constant LuGre and Dahl friction becomes damping and, on each joint, a motor without input whose
+    attribute `lugre` is the friction (MuJoCo 4.0).
 
     Args:
         model: a friction model.
         path: XML file to write; missing folders are made.
         motions, load: see `fit_damping_frictionloss`.
         info: names of the joints, by which they are found in `patch`.
-        patch: an MJCF file whose joints are given the numbers; default a file of default classes,
-            one a joint, to be included and named as the joints' `class`; a motor names its joint.
-            Motors without input that are LuGre friction of these joints are replaced.
+        patch: an MJCF file to copy with these numbers for its joints; by default a file of default
+            classes is written, one per joint, to be included and used as the joints' `class`; a
+            motor names its joint. Motors that are LuGre friction of these joints are replaced.
 
     Returns:
         The numbers and their errors.
 
     Raises:
-        ValueError: see `fit_damping_frictionloss`; or if `patch` is no MJCF, or lacks a joint of
+        ValueError: see `fit_damping_frictionloss`; or if `patch` is not MJCF, or lacks a joint of
             that name.
         OSError: if a file cannot be read or written.
     """
@@ -159,15 +159,15 @@ def urdf(
 ) -> DampingFit:
     """Write a model as `<dynamics damping friction/>` of URDF joints.
 
-    Args, Returns, Raises: as `mjcf`; without `patch` the file holds the joints' elements alone, to
-        be copied into a robot.
+    Args, Returns, Raises: as `mjcf`; without `patch` the file contains only the joints' elements,
+        to be copied into a robot.
     """
     found = fit_damping_frictionloss(model, motions, load=load, info=info)
     return _written(found, path, "robot", patch)
 
 
 def _bristles(model: FrictionModel, info: ModelInfo) -> DampingFit | None:
-    """Parameters of a law that MuJoCo has itself; Dahl's is LuGre's without rise and damping."""
+    """Parameters of a law that MuJoCo has: LuGre, or Dahl, without Stribeck effect and damping."""
     if model.law not in (DAHL, LUGRE) or model.schedule.follows_motion:
         return None
     values = model.schedule.rest_coefficients().detach().tolist()
@@ -186,11 +186,11 @@ def _bristles(model: FrictionModel, info: ModelInfo) -> DampingFit | None:
 def _written(
     found: DampingFit, path: str | Path, root: str, patch: str | Path | None
 ) -> DampingFit:
-    """Write the numbers as a file of their own, or into a robot of that root element."""
+    """Write the numbers into a new file, or into a robot with that root element."""
     if patch is not None:
         write_atomically(path, patched(patch, root, found))
         return found
-    # An XML comment must not hold two hyphens.
+    # An XML comment must not contain two hyphens.
     note = "\n".join(f"       {x}" for x in str(found).replace("--", "- -").splitlines())
     whole, row = _SNIPPETS[root]
     rows = "\n".join(
@@ -205,7 +205,7 @@ def _written(
 
 
 def _add_motors(tree: ElementTree.Element, found: DampingFit) -> None:
-    """Add MuJoCo's motors, one a joint with LuGre friction, that do nothing but rub."""
+    """Add a motor of MuJoCo for each joint with LuGre friction; it has no other function."""
     if not found.lugre:
         return
     actuators = tree.find("actuator")
@@ -216,9 +216,9 @@ def _add_motors(tree: ElementTree.Element, found: DampingFit) -> None:
         ElementTree.SubElement(actuators, "dcmotor", motor, lugre=friction)
 
 
-# Files by their root element, and what they say of a joint. An MJCF has a default class for each
-# joint; elements of a URDF are to be copied into a robot.
-_NOTE = "  <!-- The nearest to the model along a recorded motion:\n{note}\n  -->\n"
+# Files by their root element, with their entry for a joint. MJCF gets a default class for each
+# joint; the elements in a URDF are to be copied into a robot.
+_NOTE = "  <!-- Closest to the model along a recorded motion:\n{note}\n  -->\n"
 _SNIPPETS = {
     "mujoco": (
         f"<mujoco>\n{_NOTE}  <default>\n{{rows}}\n  </default>\n{{motors}}</mujoco>\n",
@@ -236,7 +236,7 @@ _SNIPPETS = {
 
 
 def joint_names(model: FrictionModel, info: ModelInfo) -> tuple[str, ...]:
-    """The joints' names, or numbers from 1 where they have none."""
+    """The joints' names, or numbers from 1 if they have none."""
     return tuple(info.joint_names) or tuple(f"joint_{j + 1}" for j in range(model.joints))
 
 
@@ -248,8 +248,8 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
         )
     if model.law.memory is not None:
         raise ValueError(
-            f"damping and friction loss have no memory, and the law {model.law.name!r} has: export "
-            "a model without, such as coulomb-viscous."
+            f"damping and friction loss have no memory, but the law {model.law.name!r} has: export "
+            "a model without memory, such as coulomb-viscous."
         )
     time, q, qd, qdd = map(torch.as_tensor, (motion.time, motion.q, motion.qd, motion.qdd))
     weight = torch.ones_like(qd) if load is None else load(q, qd)
@@ -264,7 +264,7 @@ def _fit(columns: np.ndarray, tau: np.ndarray, joint: int) -> tuple[float, float
 
     sizes = np.sqrt((columns**2).mean(0))
     if not (np.isfinite(tau).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
-        raise ValueError(f"joint {joint + 1} stands still along the motion, or it is not finite.")
+        raise ValueError(f"joint {joint + 1} does not move, or its motion is not finite.")
     found, _ = nnls(columns / sizes, tau)
     damping, frictionloss = (found / sizes).tolist()
     return damping, frictionloss
@@ -278,7 +278,7 @@ def patched(path: str | Path, root: str, found: DampingFit) -> bytes:
         raise ValueError(f"{path}: {error}") from error
     if tree.tag != root:
         raise ValueError(f"{path}: the root element is <{tree.tag[:40]}>, not <{root}>.")
-    # In MJCF other things refer to joints by elements of that name too.
+    # In MJCF, elements of that name also refer to joints elsewhere.
     bodies = tree.findall("worldbody") if root == "mujoco" else [tree]
     joints = [joint for body in bodies for joint in body.iter("joint")]
     for name, d, f in zip(found.joint_names, found.damping, found.frictionloss, strict=True):

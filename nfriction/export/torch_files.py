@@ -1,8 +1,8 @@
 """Artefacts of torch: TorchScript, for Python or LibTorch, and programs of `torch.export`.
 
-A program in a file may do anything as it is loaded. So none is: files are read as data, and what
-torch runs is the program that it writes for the model here and now, with the numbers of the file,
-if both programs are the same.
+A program in a file may do anything when it is loaded, so none is loaded: files are read as data,
+and torch runs the program that it now writes for the model, with the numbers of the file, if both
+programs are the same.
 """
 
 import io
@@ -34,15 +34,15 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.version import __version__
 
-# Name under which the metadata lie in an artefact.
+# Name of the metadata in an artefact.
 METADATA = "nfriction.json"
 LARGEST = 256 * 2**20
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError,
             ValueError, LookupError, OverflowError)  # fmt: skip
-# Files of plain numbers, and those in which one program may differ: metadata and line numbers.
+# Files of plain numbers, and files that may differ for one program: metadata and line numbers.
 _NUMBERS = re.compile(r"constants/\d+|data/weights/weight_\d+|data/constants/tensor_\d+")
 _BESIDE = re.compile(r"extra/nfriction\.json|code/.*\.debug_pkl|\.data/serialization_id")
-# torch numbers the classes that it has scripted since the process began.
+# torch numbers the classes scripted since the process began.
 _COUNTED = re.compile(rb"___torch_mangle_\d+")
 
 
@@ -55,18 +55,18 @@ def torchscript(
     with_filter: bool = False,
     cutoff_hz: float = 20.0,
 ) -> Path:
-    """Write a model as TorchScript, frozen, all joints in stacked tensors.
+    """Write a model as frozen TorchScript, with all joints in stacked tensors.
 
     The artefact is `module(qd, qdd, load) -> tau_f`, every argument (*batch, joint) in SI and
     float64, on the CPU. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
     with a memory `step(qd, qdd, load, state)` from `initial_state(qd, qdd)`, with the filter
     `step(q, load, state)` from `initial_state(q)`, both with the next state as a fourth result. The
-    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. It is loaded again
-    and compared with the model before it takes its place.
+    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. The file is loaded
+    again and compared with the model before it is put in place.
 
     Args:
         model: a friction model.
-        path: file to write, by custom `.pt`; missing folders are made.
+        path: file to write, usually `.pt`; missing folders are made.
         info: description of the model besides its parameters.
         torque_limit, with_filter, cutoff_hz: see `controller_of`.
 
@@ -104,7 +104,7 @@ def _script(controller: Controller, metadata: str) -> bytes:
 
 @torch.no_grad()
 def _check_torque(controller: Controller, module: Any, contract: Contract) -> None:
-    """Refuse a TorchScript whose `forward` is not the model."""
+    """Refuse a TorchScript whose `forward` differs from the model."""
     inputs = draw_motion(controller, 1000)
     expected, got = controller.torque(*inputs), module(*inputs)
     scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)
@@ -120,7 +120,7 @@ def _script_runner(module: Any, controller: Controller) -> Runner:
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
         if not controller.state_size:
             return tuple(module.step(*inputs))
-        # The load, which comes last, has no part in the state before the first step.
+        # The state before the first step does not depend on the load, which comes last.
         start = module.initial_state(*(x[0] for x in inputs[:-1]))
         return run_in_order(module.step, inputs, start)
 
@@ -128,14 +128,14 @@ def _script_runner(module: Any, controller: Controller) -> Runner:
 
 
 def script_runner(path: str | Path, controller: Controller) -> Runner:
-    """Load a TorchScript; its program must be that of the controller, its numbers need not be."""
+    """Load a TorchScript with the controller's program; its numbers may differ."""
     with silent():
         module = torch.jit.load(own_program(path, _script(controller, "")), map_location="cpu")
     return _script_runner(module, controller)
 
 
 class _Host(nn.Module):
-    """A controller as hosts call it; `step` and `initial_state` come with the kind of its state."""
+    """A controller as hosts call it; `step` and `initial_state` depend on the kind of its state."""
 
     def __init__(self, controller: Controller) -> None:
         super().__init__()
@@ -182,17 +182,17 @@ def _compile(controller: Controller) -> Any:
         raise ExportError(
             f"torch {torch.__version__} has no TorchScript; use an older torch for it."
         ) from error
-    # TorchScript has no error class of its own for code that it cannot compile.
+    # TorchScript has no specific error class for code that it cannot compile.
     refusals = (FrontendError, RuntimeError, TypeError, ValueError, AttributeError, OSError,
                 SyntaxError)  # fmt: skip
     model = controller.model
     try:
-        # Tried apart from the model, so that the message is about the law's own lines.
+        # Tried separately from the model, so that the message refers to the law's own lines.
         qd, qdd, load = draw_motion(controller, 1)
         torch.jit.script(model.law.torque)(qd, load, model.schedule(qd, qdd), model.v_smooth)
     except refusals as error:
         raise ExportError(
-            f"the law {model.law.name!r} does not script; it must be a function in a file, of "
+            f"the law {model.law.name!r} cannot be scripted; it must be a function in a file, with "
             f"torch operations and annotated arguments:\n{error}"
         ) from error
     kind = (
@@ -203,7 +203,7 @@ def _compile(controller: Controller) -> Any:
     try:
         return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
     except refusals as error:
-        raise ExportError(f"the model does not script:\n{error}") from error
+        raise ExportError(f"the model cannot be scripted:\n{error}") from error
 
 
 def pt2(
@@ -218,12 +218,12 @@ def pt2(
     """Write a model as a `torch.export` program with a batch of any size.
 
     `torch.export.load(path).module()(qd, qdd, load)` gives torque, coefficients and status, every
-    argument (batch, joint) in SI and float64. Where the controller has a state, that is the last
-    argument and the last result, (batch, joint, number); one that is NaN is a fresh start. The
+    argument (batch, joint) in SI and float64. If the controller has a state, that is the last
+    argument and the last result, (batch, joint, number); a state of NaN is a fresh start. The
     metadata (see `Contract`) are JSON under `nfriction.json` in `extra_files`. The file is loaded
-    again and compared with the model before it takes its place.
+    again and compared with the model before it is put in place.
 
-    Args, Returns, Raises: as `torchscript`; the file is by custom `.pt2`.
+    Args, Returns, Raises: as `torchscript`; the file is usually `.pt2`.
     """
     controller = controller_of(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
@@ -231,7 +231,7 @@ def pt2(
     contract = contract_of(model, controller, info)
 
     def runner(path: Path) -> Runner:
-        # As bytes, for torch warns of files of another ending, as the temporary one has.
+        # As bytes, because torch warns of files with another ending, such as the temporary one.
         with silent():
             return _program_runner(torch.export.load(io.BytesIO(path.read_bytes())), controller)
 
@@ -248,7 +248,7 @@ def _program(controller: Controller, metadata: str) -> bytes:
         raise ExportError(
             f"torch {torch.__version__} writes pickled objects into a .pt2; use a newer one for it."
         ) from error
-    for node in program.graph.nodes:  # the stack names this machine's folders
+    for node in program.graph.nodes:  # the stack contains this machine's folders
         node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
     with silent():
@@ -267,7 +267,7 @@ def _program_runner(program: torch.export.ExportedProgram, controller: Controlle
 
 
 def program_runner(path: str | Path, controller: Controller) -> Runner:
-    """Load a `.pt2`; its program must be that of the controller, its numbers need not be."""
+    """Load a `.pt2` with the controller's program; its numbers may differ."""
     with silent():
         program = torch.export.load(own_program(path, _program(controller, "")))
         return _program_runner(program, controller)
@@ -296,7 +296,7 @@ class _Program(nn.Module):
         return self.controller(qd, qdd, load)
 
     def _or_start(self, state: Tensor, *inputs: Tensor) -> Tensor:
-        """The state, or that before a first sample where it is NaN."""
+        """The state, or that before a first sample if it is NaN."""
         return torch.where(state == state, state, self.controller.start(*inputs))
 
 
@@ -343,14 +343,14 @@ def contract_of_archive(path: str | Path) -> Contract:
 
 
 def own_program(path: str | Path, own: bytes) -> io.BytesIO:
-    """An archive of our own with the numbers of an artefact.
+    """An archive with our own program and the numbers of an artefact.
 
     Args:
         path: of the artefact.
-        own: what torch writes for the model that it should be.
+        own: archive that torch writes for the expected model.
 
     Raises:
-        ExportError: if it is no archive, or its program is another one.
+        ExportError: if it is not an archive, or has another program.
     """
     given, ours = _contents(path, path), _contents(path, io.BytesIO(own))
     if _computed(given) != _computed(ours):
@@ -368,13 +368,13 @@ def another_program(path: str | Path) -> str:
     """The error of an artefact whose program is not the model's."""
     return (
         f"{path}: its program is not the one that nfriction {__version__} with torch "
-        f"{torch.__version__} writes for this model, and foreign programs are not run; verify it "
-        "with the versions that wrote it, or export the model anew."
+        f"{torch.__version__} writes for this model, and other programs are not run; verify it "
+        "with the versions that wrote it, or export the model again."
     )
 
 
 def _computed(files: Mapping[str, bytes]) -> list[tuple[bytes, bytes]]:
-    """All files that say what is computed; of numbers their size alone."""
+    """All files that define the computation; for numbers only their size."""
     return sorted(
         (
             _COUNTED.sub(b"", name.encode(errors="backslashreplace")),
@@ -386,7 +386,7 @@ def _computed(files: Mapping[str, bytes]) -> list[tuple[bytes, bytes]]:
 
 
 def _contents(path: str | Path, source: str | Path | IO[bytes]) -> dict[str, bytes]:
-    """All files of an archive by their name inside its one folder; `path` names it in errors."""
+    """All files of an archive by their name in its only folder; `path` names it in errors."""
     found: dict[str, bytes] = {}
     known: set[str] = set()
     try:
@@ -400,11 +400,11 @@ def _contents(path: str | Path, source: str | Path | IO[bytes]) -> dict[str, byt
                 name = entry.filename.partition("/")[2]
                 # torch looks for names without regard to case.
                 if name.lower() in known:
-                    raise ExportError(f"{path}: holds {entry.filename[:80]!r} twice.")
+                    raise ExportError(f"{path} contains {entry.filename[:80]!r} twice.")
                 known.add(name.lower())
                 found[name] = archive.read(entry)
     except _DAMAGED as error:
         if isinstance(error, ExportError):
             raise
-        raise ExportError(f"{path}: no artefact of nfriction ({first_line(error)}).") from error
+        raise ExportError(f"{path} is no artefact of nfriction ({first_line(error)}).") from error
     return found

@@ -1,4 +1,4 @@
-"""Verify an artefact against a model file: by its own vectors, and at many points besides."""
+"""Verify an artefact against a model file: with its own vectors, and at many random points."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from nfriction.export.torch_files import contract_of_archive, program_runner, sc
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 
-# Readers of an artefact's contract, and what runs it for a controller, by the file's ending.
+# Readers of an artefact's contract, and functions that run it, by the file's ending.
 KINDS: dict[str, tuple[Callable[[Path], Contract], Callable[[Path, Controller], Runner]]] = {
     ".c": (c_contract, lambda path, _: c_runner(path)),
     ".pt": (contract_of_archive, script_runner),
@@ -38,9 +38,9 @@ class Verdict:
     """Result of the comparison of an artefact with its model.
 
     Attributes:
-        vectors: at the test vectors that it carries, edges and NaN among them.
-        points: at points drawn to 10 % beyond the range, against the model itself.
-        differences: differences of its metadata from the model file, in words.
+        vectors: at its own test vectors, including edges and NaN.
+        points: at random points up to 10 % beyond the range, against the model itself.
+        differences: between its metadata and the model file, in words.
     """
 
     vectors: Parity
@@ -49,7 +49,7 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
-        """True where the artefact is the model."""
+        """True if the artefact matches the model."""
         return self.vectors.passed and self.points.passed and not self.differences
 
 
@@ -63,33 +63,34 @@ def verify_artefact(
 ) -> Verdict:
     """Compare an artefact with the model that it should be.
 
-    An artefact is a program, and running it is how it is verified. Of torch and ONNX only the
-    program that these versions write for the model is run, with the file's numbers; a file with
-    another one is refused. C is compiled and run as it is, so only verify C from sources that you
-    trust.
+    An artefact is a program, and is verified by running it. For torch and ONNX, only the program
+    that the installed versions write for the model is run, with the file's numbers; a file with
+    another program is refused. C is compiled and run as it is, so only verify C from sources that
+    you trust.
 
     Args:
-        path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` beside it.
+        path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` in the same folder.
         model: the model, as loaded from its file.
         info: the model file's description of the model.
-        points: how many to draw; at most 2,000 where the controller has a state.
-        seed: of the draw.
+        points: number of random points; at most 2,000 if the controller has a state.
+        seed: of the random points.
 
     Raises:
-        ExportError: if it is no artefact, its program is not the model's, or it cannot be run.
-        ContractError: if its metadata are absent or damaged.
+        ExportError: if it is not an artefact, its program is not the model's, or it cannot be run.
+        ContractError: if its metadata are missing or damaged.
         ImportError: if a package that runs it is missing.
         OSError: if it cannot be read.
     """
     path = Path(path)
     if path.suffix not in KINDS:
-        raise ExportError(f"{path}: no artefact to verify; it must be one of {', '.join(KINDS)}.")
+        raise ExportError(f"{path} is not an artefact; it must be one of {', '.join(KINDS)}.")
     if not path.is_file():
         raise FileNotFoundError(2, "there is no such file", str(path))
     contract_at, runner = KINDS[path.suffix]
     contract = contract_at(path)
     controller = _controller(model, info, contract.description)
-    # By the model's own contract: tolerance and scales of a doctored artefact might pass anything.
+    # With the model's own contract, because tolerance and scales of a manipulated artefact might
+    # accept anything.
     own = contract_of(model, controller, info, dtype=contract.description["dtype"])
     count = min(points, MOST_SUCCESSIVE) if controller.state_size else points
     inputs = draw(controller, count, seed)
@@ -105,9 +106,9 @@ def verify_artefact(
     except ExportError as error:
         if not differences:
             raise
-        raise ExportError(f"{error} It is of another model: {differences[0]}.") from None
+        raise ExportError(f"{error} It belongs to another model: {differences[0]}.") from None
     try:
-        # First, since it refuses the outputs of another law by their shapes.
+        # First, because this refuses outputs of another law by their shapes.
         at_points = compare(controller.run(*inputs), run(*inputs), own.tolerance, own.scales)
         vectors = run(*contract.inputs.values())
         at_vectors = compare(tuple(contract.outputs.values()), vectors, own.tolerance, own.scales)
@@ -121,7 +122,7 @@ def verify_artefact(
 def _controller(
     model: FrictionModel, info: ModelInfo | None, described: Mapping[str, Any]
 ) -> Controller:
-    """The controller that the artefact says it is, made of the model."""
+    """The controller that the artefact claims to be, made from the model."""
     if described.get("joints") != model.joints:
         raise ExportError(
             f"the artefact has {described.get('joints')!r} joints, the model {model.joints}."

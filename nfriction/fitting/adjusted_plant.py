@@ -1,7 +1,7 @@
 """A plant at a vector of adjustable terms.
 
-At x = 0 the plant is as given. Ratios are relative changes, `buffer = nominal (1 + x) (1 + x')`
-where two scale an entry; offsets are in SI, `buffer = nominal + x`.
+At x = 0 the plant is as given. Ratios are relative changes, `buffer = nominal (1 + x) (1 + x')` if
+two of them scale an entry; offsets are in SI units, `buffer = nominal + x`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ class PlantParameter:
 
     Attributes:
         name: as in reports.
-        change: of the plant's buffers per unit, each in the shape of its buffer; of a ratio, 1 at
+        change: of the plant's buffers per unit, each in the shape of its buffer; for a ratio, 1 at
             the entries that it scales. Empty for the delay of the torque.
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
@@ -38,7 +38,7 @@ class PlantParameter:
 
 
 def delay_index(terms: Sequence[PlantParameter]) -> int | None:
-    """Place of the torque's delay among the terms; None where it is not fitted."""
+    """Index of the torque's delay among the terms; None if it is not fitted."""
     return next((i for i, term in enumerate(terms) if term.name == TORQUE_DELAY), None)
 
 

@@ -1,8 +1,8 @@
 """Fits of Dahl, LuGre, elasto-plastic and gear friction to tables of friction torque.
 
-With all forces scaled by one factor the deflections of a bristle stay the same, so they follow from
-the stiffness over the Coulomb friction, and from its Stribeck excess and velocity, or the growth of
-a gear's friction with the load, alone. For values of these on a grid, all simulated at once, the
+If all forces are scaled by one factor, the deflections of a bristle stay the same. So they depend
+only on the ratio of stiffness to Coulomb friction, and on the Stribeck excess and velocity, or the
+growth of a gear's friction with the load. For values of these on a grid, all simulated at once, the
 torque is linear in the Coulomb friction, damping and viscous friction; the grid is then narrowed
 around the best.
 """
@@ -23,16 +23,16 @@ from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]
 
-# Reciprocal of the stiffness over the Coulomb friction, in ranges of the motion: the presliding
-# displacement, from what turns within a sample to what never slides.
+# Coulomb friction over stiffness, relative to the range of the motion: the presliding displacement,
+# from one that is passed within a sample to one that never slides.
 PRESLIDING = (1e-5, 1.0)
-# Excess of the friction at rest over Coulomb friction, and its velocity over the largest one.
+# Excess of static over Coulomb friction, and the Stribeck velocity, relative to the largest one.
 EXCESS, STRIBECK = (0.03, 3.0), (1e-3, 0.5)
 POINTS = {"sigma_0": 9, "F_d": 4, "v_s": 5, "mu_d": 5, "mu_b": 5}
-# Growth of the friction of a gear over that without load, by the largest load.
+# Increase of a gear's friction at the largest load, relative to that without load.
 GROWTH = (0.03, 30.0)
 NARROWINGS = 3
-# Steps of the search from the grid's best, and the difference of logarithms for derivatives.
+# Steps of the search from the best grid point, and the finite difference of logarithms.
 MOST_STEPS, DIFFERENCE = 15, 1e-4
 # Shapes times rows that are simulated at once.
 MOST_NUMBERS = 2_000_000
@@ -45,7 +45,7 @@ def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]
         law: with coefficients F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2, mu_d
             and mu_b.
         joint: with time.
-        blocks: rows that are left out in turn; shapes and forces are fitted to the others.
+        blocks: rows that are held out in turn; shapes and forces are fitted to the others.
     """
     reach, fastest = range_of(joint), float(np.abs(joint.qd).max())
     limits = {
@@ -83,8 +83,8 @@ class _Bundle:
 
     Attributes:
         shaping, shapes: names, and values (shape, name) for a Coulomb friction of 1.
-        places: coefficients in which the torque is linear, the Coulomb friction first.
-        parts: of each block, products of the unit torques with each other (block, shape, column,
+        places: indices of the linear coefficients, the Coulomb friction first.
+        parts: for each block, products of the unit torques with each other (block, shape, column,
             column), with the torque (block, shape, column), and of the torque (block,).
     """
 
@@ -99,7 +99,7 @@ class _Bundle:
         blocks: Sequence[NDArray[np.intp]],
     ) -> "_Bundle":  # fmt: skip
         grams, rights = [], []
-        # Long tables, a few shapes at a time.
+        # A few shapes at a time, because tables may be long.
         for some in np.array_split(shapes, -(-len(shapes) * len(joint) // MOST_NUMBERS)):
             places, units = unit_torques(law, joint, shaping, some)
             parts = [units[:, block] for block in blocks]
@@ -124,7 +124,7 @@ class _Bundle:
         return gram, right, float(square)
 
     def costs(self, products: tuple[Array, Array, float]) -> Array:
-        """Sum of squares of every shape with the forces that suit it, (shape,)."""
+        """Sum of squares of every shape with its best forces, (shape,)."""
         gram, right, square = products
         return np.array([square + _forces(g, r)[1] for g, r in zip(gram, right, strict=True)])
 
@@ -157,20 +157,20 @@ class _Bundle:
 
 
 def load_of(joint: JointTorque) -> Tensor:
-    """Load of every row, 1 where the table has none, (row,)."""
+    """Load of every row, 1 if the table has none, (row,)."""
     return torch.tensor(np.ones_like(joint.qd) if joint.load is None else joint.load)
 
 
 def unit_torques(
     law: Law, joint: JointTorque, shaping: list[str], shapes: Array
 ) -> tuple[tuple[int, ...], Array]:
-    """Places of the linear coefficients, and their unit torques (shape, row, coefficient).
+    """Indices of the linear coefficients, and their unit torques (shape, row, coefficient).
 
-    The damping is taken as it is far below its limit.
+    The damping is that far below its limit.
     """
     linear: list[str] = [n for n in ("F_c", "sigma_1", "F_v", "sigma_2") if n in law.names]
     places = tuple(law.names.index(name) for name in linear)
-    # Only those keep their given value that are set nowhere below.
+    # Coefficients that are not set below keep their initial value.
     base = np.tile([c.initial_grid[0] if c.initial_grid else 0.0 for c in law.coefficients],
                    (len(shapes), 1))  # fmt: skip
     base[:, places[1:]] = 0.0
@@ -216,20 +216,20 @@ def torques(law: Law, joint: JointTorque, coefficients: Array) -> Array:
 
 
 def refined(law: Law, joint: JointTorque, start: Array) -> tuple[Array, Array, Array, list[int]]:
-    """Coefficients at the minimum next to a start.
+    """Coefficients at the minimum nearest to a start.
 
     Returns:
-        Coefficients; their torque, (row,); its derivatives by those that are fitted, (row, fitted);
-        the places of these.
+        Coefficients; their torque, (row,); its derivatives in the fitted ones, (row, fitted); the
+        indices of these.
     """
-    # In logarithms, so that all stay positive; what the grid found to be zero stays zero.
+    # In logarithms, so that all stay positive; coefficients that the grid found to be zero stay so.
     places = [k for k, c in enumerate(law.coefficients) if c.fitted and start[k] > 0]
     x, damping = start, 1e-3
     torque, slopes = _linearised(law, joint, x, places)
     for _ in range(MOST_STEPS):
         error = torque - joint.tau
         gram = slopes.T @ slopes
-        # The shortest step, as rows that only slide leave some coefficients undetermined.
+        # The minimum-norm step, because rows that only slide leave some coefficients undetermined.
         damped = gram + damping * np.diag(np.diag(gram))
         step = np.linalg.lstsq(damped, -slopes.T @ error, rcond=None)[0]
         trial = x.copy()
@@ -248,7 +248,7 @@ def refined(law: Law, joint: JointTorque, start: Array) -> tuple[Array, Array, A
 def _linearised(
     law: Law, joint: JointTorque, coefficients: Array, places: list[int]
 ) -> tuple[Array, Array]:
-    """Torque, and its derivatives by the logarithms of the coefficients in these places."""
+    """Torque, and its derivatives in the logarithms of the coefficients with these indices."""
     sets = np.repeat(coefficients[None], 1 + 2 * len(places), 0)
     for k, place in enumerate(places):
         sets[1 + k, place] *= np.exp(DIFFERENCE)
@@ -259,6 +259,6 @@ def _linearised(
 
 
 def _forces(gram: Array, right: Array) -> tuple[Array, float]:
-    """Forces, none negative, and the sum of squares but for that of the torque."""
+    """Non-negative forces, and the sum of squares without that of the torque."""
     solution = weights(gram, right, 1e-9, signed=0)
     return solution, float((solution @ gram - 2 * right) @ solution)

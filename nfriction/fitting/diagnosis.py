@@ -1,7 +1,7 @@
-"""Typical mistakes in recordings and rigs, found by the balance of torques.
+"""Typical mistakes in recordings and rigs, found from the balance of torques.
 
 A mistake leaves torque that no friction explains. Each hypothesis corrects one mistake; the balance
-shows which correction explains the motion. One pass of inverse dynamics each, no simulation.
+shows which correction explains the motion. Each takes one pass of inverse dynamics, no simulation.
 """
 
 import math
@@ -26,7 +26,7 @@ from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
 
-# Samples of a block that show a curvature despite their noise.
+# Samples in a block from which a curvature is visible despite their noise.
 FEWEST_FOR_CURVATURE = 5
 # With fewer blocks, one of the corrections would explain most of the torque by chance.
 FEWEST_BLOCKS = 20
@@ -40,8 +40,8 @@ class Mistake:
 
     Attributes:
         text: a clause such as "the sign of joint2's position is reversed".
-        unexplained: share of the torque that friction does not explain once it is corrected [-];
-            NaN where no correction is known.
+        unexplained: share of the torque that friction does not explain after the correction [-];
+            NaN if no correction is known.
     """
 
     text: str
@@ -52,7 +52,7 @@ class Mistake:
 class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
 
-    `time` is that since the start of a recording [s], (sample, 1).
+    `time` counts from the start of a recording [s], (sample, 1).
     """
 
     q: Tensor
@@ -72,9 +72,9 @@ class _Data:
 
     @cached_property
     def moving(self) -> Tensor:
-        """1 where a joint turns one way during a block, else 0, (block, joint).
+        """1 where a joint turns in one direction throughout a block, else 0, (block, joint).
 
-        Dry friction takes any value at rest, so the balance says nothing there.
+        Dry friction can have any value at rest, so the balance shows nothing there.
         """
         return (self.mean(torch.sign(self.qd)).abs() == 1).to(self.qd)
 
@@ -94,19 +94,19 @@ def likely_mistakes(
     *,
     zeroed: bool = False,
 ) -> tuple[float, tuple[Mistake, ...]]:
-    """Share of unexplained torque as recorded, and mistakes whose correction explains far more.
+    """Share of unexplained torque as recorded, and mistakes whose correction reduces it greatly.
 
     Args:
         plant: the mechanism as given.
         recordings: in joint coordinates.
-        motions: theirs, smoothed.
+        motions: of the recordings, smoothed.
         convention: of the recorded angles.
-        options: `diagnosis_ratio` and the like.
-        zeroed: encoders were set to zero at the start of each recording, wherever that was.
+        options: `diagnosis_ratio` and related settings.
+        zeroed: encoders were set to zero at the start of each recording, in any pose.
 
     Returns:
-        The share [-], and the mistakes that the data support, best first: several where the data
-        do not distinguish them, none where no correction divides the share by `diagnosis_ratio`.
+        The share [-], and the mistakes that the data support, best first: several if the data do
+        not distinguish them, none if no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
     if len(given.q) < FEWEST_BLOCKS * given.block:
@@ -115,11 +115,11 @@ def likely_mistakes(
     delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)
-        # A torque that is held until the next sample acts late by up to a step.
+        # A torque that is held until the next sample acts up to one step late.
         if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
             sound = min(delay[1], sound)
     tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
-    # With different zeros, recordings of one rig balance differently.
+    # With different zeros, recordings of the same rig have different balances.
     if len(recordings) > 1 and not zeroed:
         tested.append(_odd_one_out(plant, recordings, motions, options))
     found = [
@@ -138,8 +138,8 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
         return ()
     causes = ", or ".join(mistake.text for mistake in mistakes)
     left = (
-        f" Corrected, friction leaves {mistakes[0].unexplained:.2g} of the torque unexplained, and "
-        f"not {stated:.2g}."
+        f" With the correction friction leaves {mistakes[0].unexplained:.2g} of the torque "
+        f"unexplained, without it {stated:.2g}."
     )
     known = not math.isnan(mistakes[0].unexplained)
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
@@ -151,9 +151,9 @@ def _driven_without_torque(
     motions: Sequence[Motion],
     options: FitOptions,
 ) -> Iterator[Mistake]:
-    """The first recording whose energy rises by more than an error of the rig could feign."""
+    """The first recording whose energy rises by more than an error of the rig could explain."""
     for recording, motion in zip(recordings, motions, strict=True):
-        # At rest, or held: rounding is all that moves.
+        # At rest, or held: only rounding moves.
         if not np.ptp(recording.q, axis=0).all():
             continue
         kinetic, potential = plant.energy(torch.tensor(motion.q), torch.tensor(motion.qd))
@@ -163,7 +163,7 @@ def _driven_without_torque(
             text = (
                 f"{recording.name or 'a recording'} has no torque, but its motion gains energy up "
                 f"to {motion.time[rise.argmax()]:.3g} s; name the columns of the torque, or cut "
-                "off the part in which something else drives it"
+                "off the part in which it is driven"
             )
             yield Mistake(text, math.nan)
             return
@@ -197,7 +197,7 @@ def _tested(
 def _odd_one_out(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> tuple[str, float]:
-    """The recording that friction of its own explains least, and what the others leave."""
+    """The recording that friction explains worst, and the unexplained share of the others."""
     pairs = list(zip(recordings, motions, strict=True))
     few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(pairs)))
     alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
@@ -205,7 +205,7 @@ def _odd_one_out(
     name = recordings[odd].name or f"recording {odd + 1}"
     del pairs[odd]
     others = _collect([r for r, _ in pairs], [m for _, m in pairs], options)
-    text = f"{name} is of another rig, or recorded in another way, than the others"
+    text = f"{name} is from another rig than the others, or was recorded differently"
     return text, _unexplained(plant, others)
 
 
@@ -220,14 +220,14 @@ def _collect(
 
     The delay grows by `drift` with time [-].
     """
-    # Both sides of the balance are averaged alike, which takes the noise of accelerations out.
+    # Both sides of the balance are averaged in the same way, which removes noise of accelerations.
     block = max(1, round(options.diagnosis_block / recordings[0].sample_time))
-    # Blocks are left out evenly where there are more samples than needed; at a high rate a block
-    # has many.
+    # Blocks are dropped evenly if there are more samples than needed; at a high rate a block has
+    # many.
     most = max(options.diagnosis_samples, 10 * FEWEST_BLOCKS * block)
     stride = block * math.ceil(sum(map(len, recordings)) / most)
     parts: list[tuple[Array, ...]] = []
-    # Ends of a recording are left out by the longest delay, so that every delay has the same data.
+    # The longest delay is cut off both ends of a recording, so that every delay has the same data.
     for recording, motion in zip(recordings, motions, strict=True):
         stamps, margin = motion.time, options.edge + options.largest_delay
         inside = np.flatnonzero((stamps >= stamps[0] + margin) & (stamps <= stamps[-1] - margin))
@@ -273,15 +273,15 @@ def _corrected_positions(
             text = (
                 f"the sign of {name}'s position is reversed"
                 if factor < 0
-                else f"{name}'s position is {1 / factor:g} times too large (counts a revolution)"
+                else f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
             )
             yield text, recorded(scale)
-        # The first link's half turn is the convention's.
+        # A half turn of the first link is a matter of the convention.
         turns = (-90, 90) if j == first else (-90, 90, 180)
         for degrees in turns if chain and j >= first else ():
             text = f"{name}'s position is {-degrees if degrees < 180 else 180} degrees off"
             yield text, recorded(eye, math.radians(degrees) * eye[j])
-    # On a driven rig the same as reversed torques, which are listed besides.
+    # On a driven rig this is equivalent to reversed torques, which are also listed.
     yield "the signs of all positions are reversed", recorded(-eye)
     for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
         yield f"positions are in {unit}", recorded(factor * eye)
@@ -329,7 +329,7 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
     for text, change in changes.items():
         if change and change.keys() <= data.keys():
             parts = {key: values.tolist() for key, values in change.items()}
-            # Some would be no mechanism, or an odd one.
+            # Some would be no mechanism, or a strange one.
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 corrected = plant.from_dict({**data, **parts})
@@ -370,11 +370,11 @@ def _corrected_torques(
     for what, joints in groups:
         part = torch.zeros_like(given.tau)
         part[:, joints] = given.tau[:, joints]
-        # The gain is found beside the friction, as dry friction biases a ratio of torques.
+        # The gain is estimated together with the friction, which would bias a ratio of torques.
         without = replace(given, tau=given.tau - part)
         gain = _balance(without, without.tau - given.needed(plant), part)[1]
         if abs(gain - 1) > options.gain_term[0]:
-            # Three digits: 1000 and not 1e+03.
+            # Three digits, but 1000 and not 1e+03.
             times = f"{float(f'{1 / gain:.3g}'):g} times too large"
             wrong = f"is {times} (a unit, torque constant or gear ratio)"
             cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
@@ -382,7 +382,7 @@ def _corrected_torques(
     needed = given.needed(plant)
     for j in driven:
         tau = given.tau[:, j]
-        # Where gravity calls for one sign alone, this one changes nothing.
+        # If gravity requires only one sign, this changes nothing.
         if bool((tau >= 0).all() or (tau <= 0).all()):
             signed = given.tau.clone()
             signed[:, j] = tau.abs() * torch.sign(needed[:, j])
@@ -391,7 +391,7 @@ def _corrected_torques(
 
 
 def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
-    """Each drive with the limit of its torque that explains most."""
+    """Each drive with the torque limit that explains most."""
     for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
         largest = float(given.tau[:, j].abs().max())
 
@@ -410,11 +410,11 @@ def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
 
 
 def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:
-    """Each driven joint with a spring behind the inertia of its drive.
+    """Each driven joint with a spring between the inertia of its drive and the link.
 
-    Beside the torque of a rigid joint, the drive's inertia B then takes B/k times that torque's
-    second derivative (M. W. Spong, J. Dyn. Sys. Meas. Control 109 (1987), 310-319), as it turns
-    ahead of the joint by the torque over the stiffness k.
+    The drive's inertia B then takes, in addition to the torque of a rigid joint, B/k times that
+    torque's second derivative (M. W. Spong, J. Dyn. Sys. Meas. Control 109 (1987), 310-319),
+    because it turns ahead of the joint by the torque over the stiffness k.
     """
     if given.block < FEWEST_FOR_CURVATURE:
         return
@@ -431,8 +431,8 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
         if ratio > 0:
             text = (
                 f"{plant.joint_names[j]} is elastic or has play between drive and encoder "
-                f"(resonance near {1 / (math.tau * math.sqrt(ratio)):.2g} Hz), which no rigid rig "
-                "follows"
+                f"(resonance near {1 / (math.tau * math.sqrt(ratio)):.2g} Hz), which a rigid rig "
+                "cannot follow"
             )
             yield text, replace(given, tau=given.tau - ratio * part)
 
@@ -442,10 +442,10 @@ def changing_friction(
 ) -> Iterator[str]:
     """A sentence for each driven joint whose friction grows or falls during the recordings.
 
-    For the arguments see `likely_mistakes`. A wrong law, rig or delay is no change: friction may
-    follow the speed in any way, with a share of the torque, and the rig is fitted as well. The
-    change has to exceed the scatter of its estimates with each piece of the sliding left out, and
-    to explain the torque of these pieces: in a short motion, time and a falling speed look alike.
+    For the arguments see `likely_mistakes`. A wrong law, rig or delay must not appear as a change:
+    friction may be any function of speed plus a share of the torque, and the rig is fitted as well.
+    The change has to exceed the scatter of its estimates with each piece of the sliding left out,
+    and to predict the torque of these pieces: in a short motion, time and falling speed look alike.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
@@ -458,7 +458,7 @@ def changing_friction(
         terms = [x[sliding] for x in means]
         if not all(bool(x.isfinite().all()) for x in terms):
             continue
-        # Per time of sliding, in pieces that all have some: rest says nothing.
+        # Per time of sliding, in pieces that all contain some: rest shows nothing.
         terms[-1] = terms[-1] / (terms[-1].max() - terms[-1].min())
         piece = torch.arange(count) * pieces // count
         change = 100 * _growth(piece < 0, *terms)[0]
@@ -470,7 +470,7 @@ def changing_friction(
             yield (
                 f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} by "
                 f"{abs(change):.2g} % (within {sd * student_quantile(pieces - 1, 0.975):.2g} %) "
-                "during a recording (warm-up, payload); intervals do not count that."
+                "during a recording (warm-up, payload); the intervals do not cover this."
             )
 
 
@@ -479,14 +479,14 @@ def loose_loads(
 ) -> Iterator[str]:
     """A sentence for each driven joint whose load is loose after it reverses: play in a gear.
 
-    For the arguments see `likely_mistakes`. In the play a drive accelerates its rotor alone, so the
-    torque of the load is missing after it reversed, but not before; a wrong rig, law or delay shows
-    in both. Bristles change their torque where the velocity reverses, and that is left out. The
-    share that is missing has to exceed its scatter with each piece of the sliding left out, and be
-    most of the load: a delay of the friction alone looks like a lesser share.
+    For the arguments see `likely_mistakes`. Within the play a drive accelerates only its rotor, so
+    the torque of the load is missing after it reversed, but not before; a wrong rig, law or delay
+    appears in both. Reversals of the velocity are left out, because there bristles change their
+    torque. The missing share has to exceed its scatter with each piece of the sliding left out, and
+    be most of the load: a mere delay of the friction looks like a smaller share.
     """
     own, pieces = dict(plant.named_buffers()), options.drift_pieces * len(recordings)
-    # Every block, since a reversal lies between neighbours.
+    # Every block, because a reversal lies between adjacent blocks.
     every = replace(options, diagnosis_samples=sum(map(len, recordings)))
     data = _collect(recordings, motions, every)
     driven = np.flatnonzero(data.tau.any(0)).tolist()
@@ -509,7 +509,7 @@ def loose_loads(
         torque = data.mean(data.tau[:, j])[sliding]
         if int(turned[:-1][sliding].sum()) < pieces // 2 or not bool(known.isfinite().all()):
             continue
-        # Without their scale, as most terms of a simple rig are sums of others.
+        # Scaled, because most terms of a simple rig are sums of others.
         scale = known.square().mean(0).sqrt().clamp_min(torch.finfo(known.dtype).tiny)
         piece, found = torch.arange(len(known)) * pieces // len(known), []
         for seen in (piece != k for k in range(-1, pieces)):
@@ -522,15 +522,15 @@ def loose_loads(
         if share > max(sd * sure, 0.5 + sd * within):
             yield (
                 f"The load of {plant.joint_names[j]} is loose after it reverses: {100 * share:.0f} "
-                f"% (within {100 * sd * within:.0f} %) of its torque is missing for some "
-                f"{options.diagnosis_block:g} s (play in a gear); intervals do not count that."
+                f"% (within {100 * sd * within:.0f} %) of its torque is missing for about "
+                f"{options.diagnosis_block:g} s (play in a gear); the intervals do not cover this."
             )
 
 
 def _of_sliding(
     plant: Plant, data: _Data, j: int, options: FitOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Means of terms that explain a joint's torque, of friction and rig, and blocks of sliding."""
+    """Block means of the friction and rig terms of a joint's torque, and the blocks of sliding."""
     rest = torch.zeros_like(data.q)
     static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
     speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
@@ -540,7 +540,7 @@ def _of_sliding(
     rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
     late = rate.repeat_interleave(data.block)
     of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
-    # Smoothed over a reversal, dry friction looks like one that depends on the acceleration.
+    # Smoothed over a reversal, dry friction seems to depend on the acceleration.
     apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
     return data.mean(friction), data.mean(of_rig), apart & (data.moving[:, j] > 0)
 
@@ -548,10 +548,10 @@ def _of_sliding(
 def _growth(
     left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
 ) -> tuple[float, Tensor]:
-    """Growth of a friction in a unit of time, relative to its mean [-].
+    """Growth of friction per unit of time, relative to its mean [-].
 
-    By the terms of friction and of the rig, (block, term) each, which explain the torque. With it,
-    sums of squares of the torque that a constant and a growing friction miss on blocks left out.
+    From the terms of friction and of the rig, (block, term) each, that explain the torque. Also
+    returns the sums of squared torque errors of constant and growing friction on blocks left out.
     """
     known, seen = torch.cat([friction, of_rig], 1), ~left_out
     constant = torch.linalg.lstsq(known[seen], torque[seen]).solution
@@ -568,9 +568,9 @@ def balanced_delay(
     motions: Sequence[Motion],
     options: FitOptions = DEFAULTS,
 ) -> tuple[float, float]:
-    """Delay of torques after positions that explains most [s], and what it leaves [-].
+    """Delay of torques after positions that explains most [s], and the unexplained share [-].
 
-    For the arguments and the share of unexplained torque see `likely_mistakes`.
+    For the arguments and that share of the torque see `likely_mistakes`.
     """
     most = options.largest_delay
     return _best(
@@ -581,14 +581,14 @@ def balanced_delay(
 def _drifting_clock(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> tuple[str, float]:
-    """The drift of the torques' clock that explains most, and what it leaves [-]."""
+    """The drift of the torques' clock that explains most, and the unexplained share [-]."""
     most = options.largest_delay / max(r.duration for r in recordings)
     drift, share = _best(
         lambda x: _unexplained(plant, _collect(recordings, motions, options, drift=x)), -most, most
     )
-    fast = "fast" if drift > 0 else "slow"
+    fast = "faster" if drift > 0 else "slower"
     return (
-        f"the clock of the torques is {100 * abs(drift):.2g} % {fast} beside that of the positions",
+        f"the clock of the torques is {100 * abs(drift):.2g} % {fast} than that of the positions",
         share,
     )
 
@@ -596,10 +596,10 @@ def _drifting_clock(
 def _best(
     unexplained: Callable[[float], float], lowest: float, highest: float
 ) -> tuple[float, float]:
-    """The value that leaves least unexplained, and what it leaves."""
+    """The value with the smallest unexplained share, and that share."""
     from scipy.optimize import minimize_scalar  # slow to import
 
-    # One valley is as wide as a swing: a coarse grid finds it.
+    # The valley is as wide as a swing, so that a coarse grid finds it.
     grid = np.linspace(lowest, highest, 9)
     best = int(np.argmin([unexplained(x) for x in grid]))
     around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 8)])
@@ -618,7 +618,7 @@ def delay_in_words(delay: float) -> str:
 
 
 def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
-    """Factor of a change of buffers, in which torques are linear, that fits best."""
+    """Best-fitting factor of a change of buffers in which torques are linear."""
     own = dict(plant.named_buffers())
     moved = plant.replace(**{name: own[name] + part for name, part in change.items()})
     needed = given.needed(plant)
@@ -628,8 +628,8 @@ def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
 def _unexplained(plant: Plant, data: _Data) -> float:
     """Share of the torque that Coulomb and viscous friction do not explain [-].
 
-    Root mean square over joints; the torque of a joint is the sum of squares of the drive's, of
-    gravity's and of inertia's.
+    Root mean square over joints, relative to the sum of squares of the torques of drive, gravity
+    and inertia.
     """
     needed, rest = data.needed(plant), torch.zeros_like(data.q)
     target = _balance(data, data.tau - needed)[0]
@@ -640,7 +640,7 @@ def _unexplained(plant: Plant, data: _Data) -> float:
 
 
 def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, float]:
-    """Mean square of torque that friction leaves, (joint,), and the factor of an `extra` torque."""
+    """Mean square of unexplained torque, (joint,), and the factor of an `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
     left = data.moving * data.mean(torque)
@@ -650,8 +650,8 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
     # A drive may have an offset.
     offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]
     free = torch.cat([*own, offsets], -1)
-    # Friction that adds energy is excluded. A factor of either sign is the difference of two that
-    # are positive.
+    # Friction that adds energy is excluded. A factor of either sign is the difference of two
+    # positive ones.
     design = torch.cat([free, data.friction, -free], -1)
     scaled = (design / weight[:, None]).reshape(-1, design.shape[-1]).numpy()
     norm = np.linalg.norm(scaled, axis=0)

@@ -1,4 +1,4 @@
-"""Equation error: constant coefficients by regression on the torque that a motion implies."""
+"""Equation error: constant coefficients from a regression on the torque that a motion implies."""
 
 import itertools
 import math
@@ -24,11 +24,11 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# A robust loss is minimised by least squares with weights from the residuals before, so many times
-# or until no coefficient moves by more than this share of the largest.
+# A robust loss is minimised by iteratively reweighted least squares: at most this many times, or
+# until no coefficient changes by more than this fraction of the largest.
 REWEIGHTINGS = 30
 SETTLED = 1e-4
-# Scatter of a torque that is rounding, over the torque.
+# Scatter of a torque that counts as round-off, relative to the torque.
 ROUNDING = 1e-9
 
 
@@ -40,12 +40,12 @@ class TorqueFit:
         coefficients: (joint, coefficient), in SI.
         residual: root mean square of the unexplained torque, (joint,) [N m].
         torque: root mean square of the friction torque, (joint,) [N m].
-        starts: the best coefficients at each combination of initial values of those in which the
-            torque is not linear, (start, joint, coefficient).
+        starts: the best coefficients at each combination of initial values of the nonlinear
+            coefficients, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
         weight: of each sample under a robust loss, (sample, joint).
-        outliers: samples that it counts less than half.
+        outliers: samples to which it gives less than half weight.
     """
 
     coefficients: Tensor
@@ -77,7 +77,7 @@ def peak_dynamics_torque(
 ) -> tuple[Tensor, Tensor]:
     """Largest speed of each joint, and its largest torque of gravity or of inertia, (joint,).
 
-    Each of the two alone, as in a free swing they all but cancel.
+    Gravity and inertia are taken separately, because in a free swing they nearly cancel.
     """
     speeds, torques = [], []
     for motion in motions:
@@ -95,20 +95,20 @@ def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class TorqueBalance:
-    """The torque balance of one recording: friction as its smoothed motion shows it.
+    """The torque balance of one recording: friction implied by its smoothed motion.
 
-    A smoother sees an acceleration, and with it the jumps of dry friction, through a low-pass
-    filter. Where the torques and what a law makes of them pass the same filter, its bias cancels;
-    otherwise a reversal that is smeared over 50 ms would hide all friction that falls with speed.
+    A smoother low-pass filters the acceleration, and with it the jumps of dry friction. If the
+    torques and the law's regressors pass the same filter, its bias cancels; otherwise a reversal
+    smeared over 50 ms would hide all friction that falls with speed.
 
     Attributes:
         qd, load: (sample, joint).
         torque: friction torque, (sample, joint) [N m].
         kept: samples away from the ends whose direction of motion is known, (sample, joint).
-        rate: angular frequency above which the smoother forgets, (joint,) [rad/s]; None for a
-            motion that was not smoothed.
+        rate: corner frequency of the smoother, (joint,) [rad/s]; None for a motion that was not
+            smoothed.
         step: [s].
-        segments: first and last sample of each stretch without a gap.
+        segments: first and last sample of each part without a gap.
 
     References:
         M. Gautier, Dynamic identification of robots with power model, ICRA 1997 (both sides of
@@ -124,7 +124,7 @@ class TorqueBalance:
     segments: Sequence[tuple[int, int]]
 
     def smoothed(self, x: Tensor) -> Tensor:
-        """Torques (sample, joint, any) as the smoother would see them."""
+        """Torques (sample, joint, any) filtered as by the smoother."""
         if self.rate is None:
             return x
         parts = []
@@ -153,13 +153,13 @@ def _balance(
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
         tau = found.smoothed(held[..., None])[..., 0]
-        # Stiction balances any torque, and noise around zero is no direction.
+        # Stiction balances any torque, and noise around zero has no direction.
         kept = kept & (qd.abs() > NORMAL_95 * torch.as_tensor(motion.std.qd))
     return replace(found, torque=tau - plant.inverse_dynamics(q, qd, qdd), kept=kept)
 
 
 def _travelled(q: Tensor) -> Tensor:
-    """Distance of positions (sample, joint) from the last reversal, in ranges of the joint."""
+    """Distance of positions (sample, joint) from the last reversal, over the joint's range."""
     row = torch.arange(len(q))[1:-1, None]
     turned = torch.where(q.diff(dim=0)[1:] * q.diff(dim=0)[:-1] < 0.0, row, 0)
     last = torch.nn.functional.pad(turned, (0, 0, 1, 1)).cummax(0).values
@@ -167,10 +167,10 @@ def _travelled(q: Tensor) -> Tensor:
 
 
 def _smoother_rate(motion: Motion) -> Tensor | None:
-    """Corner frequency of the low-pass filter that `kalman_smoother` is, (joint,) [rad/s].
+    """Corner frequency of `kalman_smoother` as a low-pass filter, (joint,) [rad/s].
 
-    Its gain is 1 / (1 + (w / rate)^8) far from the ends; the ratio of the standard deviations of
-    acceleration and position, the square of the rate but for a constant, shows the rate.
+    Its gain is 1 / (1 + (w / rate)^8) far from the ends; the rate follows from the ratio of the
+    standard deviations of acceleration and position, which is its square up to a constant.
     """
     if motion.std is None:
         return None
@@ -191,11 +191,11 @@ def fit_equation_error(
 ) -> TorqueFit:
     """Least squares of the friction torque, joint by joint.
 
-    Linear least squares within bounds where the torque is linear in the coefficients, for every
-    combination of the law's initial values of the others, which are then refined. Samples whose
-    direction of motion is uncertain are left out, and those that have not travelled `beyond` since
-    the last reversal, in ranges of the joint. A robust loss weighs the squares. Recordings and
-    motions are in joint coordinates.
+    Linear least squares within bounds for the linear coefficients, at every combination of the
+    law's initial values of the others, which are then refined. Samples are left out if their
+    direction of motion is uncertain, or if the joint has moved by less than `beyond` times its
+    range since the last reversal. A robust loss weights the squares. Recordings and motions are in
+    joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
@@ -206,13 +206,13 @@ def fit_equation_error(
     if count <= len(law.coefficients):
         names = ", ".join(r.name or "a recording" for r in recordings)
         raise ValueError(
-            f"{names}: too few samples, {count} are left {options.edge:g} s away from the ends "
-            f"for {len(law.coefficients)} coefficients a joint; record for longer."
+            f"{names}: too few samples, {count} more than {options.edge:g} s away from the ends, "
+            f"for {len(law.coefficients)} coefficients per joint; record for longer."
         )
     kept = torch.cat([p.kept for p in parts])
     if beyond:
         kept = kept & torch.cat([_travelled(torch.as_tensor(m.q)) > beyond for m in motions])
-    # A joint that hardly ever moved has to do with what there is.
+    # A joint that hardly ever moved uses all its samples.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
     parts = [
@@ -226,7 +226,7 @@ def fit_equation_error(
 
 
 def steady_law(law: Law) -> Law:
-    """A law with memory as it slides: what only its deflections show keeps a value."""
+    """A law with memory in sliding: coefficients that only deflections reveal keep a value."""
     if law.memory is None:
         return law
     units = torch.ones(1, 1, len(law.names), dtype=torch.float64, requires_grad=True)
@@ -321,7 +321,7 @@ class _Regression:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
         rows = []
         for part in self.parts:
-            # A law is elementwise, so the sum's gradient has every sample's slopes.
+            # A law is elementwise, so the sum's gradient contains every sample's slopes.
             own = coefficients.expand(len(part.qd), -1, -1).clone().requires_grad_()
             with torch.enable_grad():
                 torque = self.law.torque(part.qd, part.load, own, self.v_smooth)
@@ -331,7 +331,7 @@ class _Regression:
         return found[..., 1:], found[..., 0] - self.root * torch.where(self.kept, self.torque, 0.0)
 
     def refined(self, coefficients: Tensor) -> Tensor:
-        """The coefficients at the minimum next to these, within the bounds of a fit."""
+        """The coefficients at the nearest minimum within the bounds of a fit."""
         lower, upper = Constant(self.law, len(coefficients), coefficients).bounds()
 
         def model(x: Tensor) -> Quadratic:
@@ -345,7 +345,7 @@ class _Regression:
         return found.x.reshape(coefficients.shape)
 
     def _linear_fit(self, design: Tensor, fixed: dict[int, float]) -> tuple[Tensor, Tensor]:
-        """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
+        """Coefficients (joint, coefficient) and residual (joint,) for given nonlinear ones."""
         from scipy.optimize import lsq_linear  # slow to import
 
         law, joints = self.law, self.torque.shape[1]
@@ -360,14 +360,14 @@ class _Regression:
             root = self.root[rows, joint]
             a = (root[:, None] * design[rows, joint]).numpy()
             y = (root * self.torque[rows, joint]).numpy()
-            # Columns of unit length, as coefficients differ by orders of magnitude.
+            # Columns of unit length, because coefficients differ by orders of magnitude.
             scale = np.linalg.norm(a, axis=0)
             scale[scale == 0] = 1.0
             system = np.concatenate([a / scale, self.options.ridge * np.eye(len(linear))])
             target = np.concatenate([y, np.zeros(len(linear))])
-            # The triangle of all rows has the same minimum, and costs the same for any table.
+            # The triangular factor has the same minimum, at the same cost for any number of rows.
             triangle = np.asarray(np.linalg.qr(np.column_stack([system, target]), mode="r"))
-            # A step along an open bound is 0 times infinity inside SciPy, which drops it.
+            # A step along an infinite bound is 0 times infinity inside SciPy, which ignores it.
             with np.errstate(invalid="ignore"):
                 found = lsq_linear(
                     triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12
@@ -404,8 +404,7 @@ def coefficient_scale(
 ) -> Tensor:
     """Size of each coefficient that alone would explain a third of the friction torque, in SI.
 
-    Shape (joint, coefficient); zero where the torque is not linear in the coefficient, or where
-    the coefficient belongs to a hidden state.
+    Shape (joint, coefficient); zero for nonlinear coefficients and those of a hidden state.
     """
     pairs = zip(recordings, motions, strict=True)
     torque = torch.cat([friction_torque(plant, r, m)[2] for r, m in pairs]).square().mean(0).sqrt()
@@ -424,10 +423,10 @@ def coefficient_scale(
 def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Tensor:
     """Standard deviation of the law's zero-mean priors in SI, (joint, coefficient).
 
-    Infinite without a prior; the torque that the law explains is the scale.
+    Infinite without a prior; scaled by the torque that the law explains.
     """
     shares = torch.tensor([c.prior_scale for c in law.coefficients], dtype=torque.torque.dtype)
-    # On a light mechanism most of the torque is an error of inertia terms and smoothing.
+    # On a light mechanism most of the torque consists of errors of inertia terms and smoothing.
     explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()
     explained = torch.maximum(explained, options.min_explained * torque.torque)
     plain = torch.tensor([c.unit == "-" for c in law.coefficients])

@@ -7,8 +7,8 @@ A fit has two stages. *Equation error*: the smoothed motion implies the friction
 in which constant coefficients are linear, so regression finds them from any start, but biased by
 the noise of qdd. *Output error*: simulations from the start of short windows must follow the
 measured positions; this refines coefficients and plant without any derivative of the data. A
-strategy, one for each kind of coefficients (`fitting.strategy`), says what is fitted in which
-order, from which start and over which windows. The next step is
+strategy, one for each kind of coefficients (`fitting.strategy`), determines the order of the
+stages, their starting points and their windows. The next step is
 `nfriction.fitting.shooting.problem`, the cost of the second stage.
 """
 
@@ -46,56 +46,56 @@ def fit(
     """Estimate a friction model from recordings.
 
     Equation error gives constant coefficients; output error over windows of growing length then
-    refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
-    warning. Laws with several minima are also started from their grid of initial values and from
-    the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
-    model starts at the constant fit of its law and is kept only if it errs less on windows held
-    out, each in turn, by more than their scatter explains; its plant prior is relaxed, its sets
-    move and it takes further inputs (`FitResult.inputs`: the direction of turning, the load of the
-    bearings) only for such a gain. An adaptive model starts at the constant fit, too;
-    `fit_adaptive` has more settings.
+    refines them and the plant. Windows so long that they worsen the result of shorter ones are
+    skipped, with a warning. Laws with several minima are also started from their grid of initial
+    values and from the simpler law that they contain (`Law.nested_law`); the lowest residual wins.
+    A neuro-fuzzy model starts at the constant fit of its law and is kept only if it improves the
+    error on hold-out windows, each held out in turn, by more than scatter explains; its plant prior
+    is relaxed, its sets move and it gets further inputs (`FitResult.inputs`: the direction of
+    rotation, the load of the bearings) only for such a gain. An adaptive model also starts at the
+    constant fit; `fit_adaptive` has more settings.
 
     Args:
-        model: the model to fit, changed in place; or its name, such as "coulomb-viscous": v_smooth
-            is then 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
+        model: the model to fit, changed in place; or its name, such as "coulomb-viscous", with
+            v_smooth 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
         plant: the mechanism as given, its name, or the path of a rig file.
         recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
             convention, by default the plant's.
         method: `"equation_error"` stops after the regression (constant coefficients only).
         windows: lengths of the shooting windows [s], in the order in which they are used.
         fit_plant: adjust inertia and gravity terms, lengths, encoder zeros, gear losses, torque
-            constants and a constant torque of each drive, within bounds.
-        drag: also fit air drag on the links. None fits it to an undriven chain on a fixed pivot: a
-            free swing loses as much to the air as to its joints, whose coefficients would absorb
-            the drag.
+            constants and a constant torque offset for each drive, within bounds.
+        drag: also fit air drag on the links. None fits it for an undriven chain on a fixed pivot: a
+            free swing loses as much energy to the air as to its joints, whose coefficients would
+            absorb the drag.
         eccentricity: `"on"` also fits the eccentricity of the encoders, `"auto"` if the evidence
-            favours it or `start` has it; not with an adaptive model. Off by default: the evidence
-            assumes the law, and a sine of the angle may absorb an error of the law.
+            favours it or `start` has it; not with an adaptive model. Off by default, because the
+            evidence assumes a correct law, and a sine of the angle may absorb an error of the law.
         encoder_reference: when incremental encoders were set to zero. `"shared"`: before all
             recordings; the offset is part of the plant. `"per_recording"`: at the start of each,
             at rest in a pose held by stiction; each recording's offset is estimated
-            (`FitResult.encoder_offsets`), also that of a recording to be scored. `"auto"`:
+            (`FitResult.encoder_offsets`), also for a recording to be scored. `"auto"`:
             `"per_recording"` if several recordings of a driven chain all begin at rest with every
             encoder at zero, with a warning.
-        start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
-            for the plant's terms.
+        start: an earlier fit to start from: of the same law for a neuro-fuzzy model; only the plant
+            terms are used from that of another model.
         motions: smoothed motions in joint coordinates, to save smoothing again.
         max_steps: limit of steps at each window length.
         loss: `"linear"` for least squares, or a robust loss by SciPy's names, `"soft_l1"`,
-            `"huber"` or `"cauchy"`, for logs with spikes: errors beyond about the normal scatter
-            count less, and `FitResult.outliers` names the samples. Its scale comes from the
-            median error of each joint.
-        fit_delay: also estimate by how much torques are recorded later than positions, one delay
-            for all (`FitResult.torque_delay`, with an interval), as a bus or a filter causes it.
+            `"huber"` or `"cauchy"`, for logs with spikes: errors beyond the normal scatter get less
+            weight, and `FitResult.outliers` names the samples. Its scale comes from the median
+            error of each joint.
+        fit_delay: also estimate the delay of torques relative to positions, such as a bus or a
+            filter causes; one delay for all (`FitResult.torque_delay`, with an interval).
         callback: called with a stage name after every step; True stops.
 
     Returns:
         The fit; read `converged`, `status` and `warnings`.
 
     Raises:
-        TypeError: if model, plant or recordings are something else.
-        ValueError: if recordings and plant do not match, one is given twice, holds too little or
-            lacks a torque that the law reads, or an option does not exist.
+        TypeError: if model, plant or recordings have another type.
+        ValueError: if recordings and plant do not match, a recording is given twice, is too short
+            or lacks a torque that the law reads, or an option does not exist.
     """
     options = FitOptions(
         method, windows, fit_plant, drag,
@@ -107,8 +107,8 @@ def fit(
         raise ValueError(f"cannot fit coefficients of type {type(schedule).__name__}.")
     if method == "equation_error" and schedule.follows_motion:
         raise ValueError(
-            'adaptive and neuro-fuzzy models need `method="output_error"`, simulated windows.'
+            'adaptive and neuro-fuzzy models need simulated windows: `method="output_error"`.'
         )
-    # By name, so that a schedule outside the core brings a strategy of its own.
+    # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     return strategy(task).with_warnings(task.data_warnings, task.mistakes, task.unmodelled)

@@ -1,7 +1,7 @@
 """Fits of slip elements to tables of friction torque, by non-negative least squares.
 
-The widths of the elements come from a fine grid, of which non-negative weights keep a few; terms of
-the velocity are added where they lower the error on blocks left out.
+The widths of the elements come from a fine grid, from which non-negative weights select a few;
+terms of the velocity are added if they lower the error on hold-out blocks.
 """
 
 import itertools
@@ -20,25 +20,25 @@ from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]
 
-# Widths of elements over the range of the motion: what is narrower turns within a sample, what is
-# wider is a spring.
+# Widths of elements over the range of the motion: narrower ones slip within a sample, wider ones
+# are springs.
 SPAN = (3e-5, 2.0)
 COUNT = 30
-# Moves before the first row over the range of the motion, which the first torques show.
+# Motion before the first row over the range of the motion, estimated from the first torques.
 PATHS = tuple(np.geomspace(1e-4, 2.0, 10))
 # Path over which the excess of a long rest fades, over the range of the motion.
 FADINGS = tuple(np.geomspace(1e-5, 0.1, 9))
-# Velocities over the largest one.
+# Velocities relative to the largest one.
 VELOCITIES = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
 # Ridges relative to the information of the data: neighbouring widths are nearly equivalent.
 RIDGES = (1e-2, 1e-3)
-# Columns that no velocity shapes, and the place of a rest's excess among them.
+# Number of columns without a shaping velocity, and the index of a rest's excess among them.
 PLAIN, REST = 3, 2
-# Terms of a choice before its elements: these, one that saturates, and a drop.
+# Terms before the elements: the plain ones, one that saturates, and one that drops.
 LINEAR = PLAIN + 2
-# Relative difference of errors on blocks left out that is too small to choose by.
+# Relative difference of errors on hold-out blocks that is too small to matter.
 TOLERANCE = 0.02
-# Time whose torque shows how a law with memory was deflected before, as for simulations [s].
+# Time from whose torque the initial deflection is estimated, as for simulations [s].
 LEAD_IN = 0.2
 # Rows from which the start is chosen; it is forgotten over the first strokes.
 START_ROWS = 3000
@@ -53,9 +53,9 @@ class MemoryFit:
         errors: root mean square error on each block left out [N m; N].
         torque: predicted at all rows, (row,).
         design: torque per unit of each fitted coefficient, (row, fitted).
-        fitted: places of these among the coefficients.
-        presliding: False where no stiffness explains the rows better than a stiff joint does.
-        without: torque by the fit without each block, at all rows, (block, row), where known.
+        fitted: indices of these among the coefficients.
+        presliding: False if no stiffness explains the rows better than a stiff joint does.
+        without: torque predicted by the fit without each block, (block, row), if known.
     """
 
     coefficients: Array
@@ -68,7 +68,7 @@ class MemoryFit:
 
 
 def path_of(joint: JointTorque) -> Array:
-    """Displacement of every row from the row before, (row,) [rad; m]."""
+    """Displacement of every row from the previous row, (row,) [rad; m]."""
     assert joint.time is not None
     if joint.q is not None:
         return np.diff(joint.q, prepend=joint.q[0])
@@ -76,7 +76,7 @@ def path_of(joint: JointTorque) -> Array:
 
 
 def range_of(joint: JointTorque) -> float:
-    """Range of the positions that a joint passes [rad; m]."""
+    """Range of a joint's positions [rad; m]."""
     return float(np.ptp(np.cumsum(path_of(joint))))
 
 
@@ -87,7 +87,7 @@ def deflections(path: Array, widths: Array, start: Array, every: int = 1) -> Arr
         path: displacement of every row, (row,).
         widths: (width,).
         start: deflections over widths before the first row, (..., width).
-        every: rows of which one is kept.
+        every: decimation of the rows.
     """
     moves = path[:, None] / widths
     found = np.empty((-(-len(path) // every), *start.shape))
@@ -104,9 +104,9 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
 
     Args:
         joint: with time.
-        blocks: rows that are left out in turn; a term or a smaller ridge that does not lower the
-            error there by more than chance is left out.
-        loaded: friction is in proportion to the load.
+        blocks: rows that are held out in turn; a term or a smaller ridge is used only if it lowers
+            the error there by more than chance.
+        loaded: friction is proportional to the load.
     """
     path, grid = path_of(joint), range_of(joint) * np.geomspace(*SPAN, COUNT)
     every = max(1, len(joint) // START_ROWS)
@@ -122,7 +122,7 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     left_out = [fine.left_out(choice, folds) for choice in choices]
     squares = torch.tensor(left_out).square()
     best = squares[int(squares.sum(1).argmin())]
-    # The simplest of which the best is no better than by chance.
+    # The simplest choice over which the best is no better than by chance.
     chosen = next(k for k, own in enumerate(squares) if not gains(best, own, DEFAULTS.input_chance))
     choice = choices[chosen]
     without = np.stack([fine.without(choice, fold) for fold in folds])
@@ -136,7 +136,7 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
 def _likeliest_start(
     joint: JointTorque, widths: Array, every: int, loaded: bool
 ) -> tuple[float, float]:
-    """Path of the move before the first row, and the fading, that explain the torque best."""
+    """Path of the motion before the first row, and the fading, that explain the torque best."""
     reach = range_of(joint)
     paths = reach * np.array([0.0, *PATHS, *(-x for x in PATHS)])
     starts = np.clip(paths[:, None] / widths, -1.0, 1.0)
@@ -154,20 +154,20 @@ def _likeliest_start(
 
 
 def _merged(forces: Array, widths: Array) -> Array:
-    """Widths with neighbours that have a force merged, the narrowest first, `ELEMENTS` at most."""
+    """Widths after merging adjacent elements with a force, narrowest first, at most `ELEMENTS`."""
     used = np.flatnonzero(forces > 1e-6 * forces.max(initial=0.0))
     groups = np.split(used, np.flatnonzero(np.diff(used) > 1) + 1) if len(used) else []
     found = [
         (float(forces[g].sum()), float(np.exp(np.average(np.log(widths[g]), weights=forces[g]))))
         for g in groups
     ]
-    # The first element, whose friction drops with speed, is the narrowest in any case.
+    # The first element, whose friction drops with speed, is always the narrowest.
     rest = sorted((pair for pair in found if pair[1] > 1.01 * widths[0]), reverse=True)
     return np.array([widths[0], *sorted(width for _, width in rest[: ELEMENTS - 1])])
 
 
 class _Shape(NamedTuple):
-    """Ridge, and terms beside the elements, the offset and viscous friction."""
+    """Ridge, and terms in addition to the elements, the offset and viscous friction."""
 
     ridge: float
     saturating: bool = False
@@ -184,7 +184,7 @@ class _Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class _Choice:
-    """Weights of the columns in given places, -1 for a term that is left out."""
+    """Weights of the columns with given indices, -1 for an omitted term."""
 
     shape: _Shape
     places: tuple[int, ...]
@@ -193,7 +193,7 @@ class _Choice:
 
 
 class _Fold(NamedTuple):
-    """Rows that are left out, and the products of the others' columns."""
+    """Hold-out rows, and the products of the others' columns."""
 
     block: NDArray[np.intp]
     gram: Array
@@ -202,7 +202,7 @@ class _Fold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """Columns of all terms: offset, viscous, of a rest, of velocities, and elements.
+    """Columns of all terms: offset, viscous, excess of a rest, velocities, and elements.
 
     Attributes:
         whole: (row, column).
@@ -227,7 +227,7 @@ class _Dictionary:
         speeds = np.abs(joint.qd).max() * np.array(VELOCITIES)
         ratio = joint.qd[:, None] / speeds
         scaled = [np.tanh(ratio), z[:, :1] * np.exp(-(ratio**2)), z]
-        # A rest adds to the friction that holds the joint, and so has the elements' sign.
+        # A rest adds to the friction that holds the joint, so it has the elements' sign.
         held = float(np.sign(z[0].sum())) or float(np.sign(joint.tau[0]))
         rest = held * np.exp(-np.cumsum(np.abs(path_of(joint))) / fading)
         plain = np.stack([np.ones_like(load), joint.qd, rest], 1)
@@ -238,7 +238,7 @@ class _Dictionary:
         return cls(whole, joint.tau, speeds, gram, right, lead, fading)
 
     def options(self, shape: _Shape) -> Iterator[tuple[int, ...]]:
-        """Places of the columns, for every choice of velocities."""
+        """Indices of the columns, for every choice of velocities."""
         n = len(self.velocities)
         first = PLAIN + 2 * n
         turns = range(PLAIN, PLAIN + n) if shape.saturating else (-1,)
@@ -248,38 +248,38 @@ class _Dictionary:
             yield (0, 1, rest, turn, drop, *range(first, self.whole.shape[1]))
 
     def best(self, shape: _Shape) -> _Choice:
-        """The choice of velocities with the least sum of squares."""
+        """The choice of velocities with the smallest sum of squares."""
         found = (self._choice(shape, places) for places in self.options(shape))
         return min(found, key=lambda choice: choice.cost)
 
     def at(self, choice: _Choice) -> _Choice:
-        """The same terms with the weights that suit these elements."""
+        """The same terms with the best weights for these elements."""
         first = PLAIN + 2 * len(self.velocities)
         places = (*choice.places[:LINEAR], *range(first, self.whole.shape[1]))
         return self._choice(choice.shape, places)
 
     def folds(self, blocks: Sequence[NDArray[np.intp]]) -> "list[_Fold]":
-        """Blocks to leave out in turn, each with the products of the others."""
+        """Blocks to hold out in turn, each with the products of the others."""
         parts = [(self.whole[b].T @ self.whole[b], self.whole[b].T @ self.tau[b]) for b in blocks]
         found = []
         for k, block in enumerate(blocks):
-            # Summed anew: a difference would leave rounding in columns that live in one block.
+            # Summed anew: a difference would leave round-off in columns that only one block has.
             rest = [pair for i, pair in enumerate(parts) if i != k]
             gram, right = (np.sum(x, 0) for x in zip(*rest, strict=True))
             found.append(_Fold(block, gram, right))
         return found
 
     def left_out(self, choice: _Choice, folds: "Sequence[_Fold]") -> list[float]:
-        """Root mean square errors on blocks that are left out in turn."""
+        """Root mean square errors on blocks that are held out in turn."""
         pairs = [(self.without(choice, fold, fold.block), self.tau[fold.block]) for fold in folds]
         return [float(np.sqrt(np.mean((torque - tau) ** 2))) for torque, tau in pairs]
 
     def without(
         self, choice: _Choice, fold: "_Fold", rows: NDArray[np.intp] | slice = slice(None)
     ) -> Array:
-        """Torque at rows by the same terms fitted without a block.
+        """Torque at rows from the same terms fitted without a block.
 
-        The excess of a rest before is that of the lead-in, as for any other table.
+        The excess of a preceding rest is that of the lead-in, as for any other table.
         """
         used = np.array([p for p in choice.places if p >= 0])
         law = used != REST
@@ -311,9 +311,9 @@ class _Dictionary:
         )
         offset, viscous, _, saturating, falling = choice.weights[:LINEAR]
         blank = [0.0] * (ELEMENTS - len(forces))
-        # Elements without force are as wide as the widest.
+        # Elements without force get the largest width.
         wide = [float(widths[-1])] * len(blank)
-        # Without an excess it would be gone at once.
+        # Without an excess, an arbitrarily fast fading.
         fading = self.fading if choice.shape.rested else 1e-6 * float(widths[0])
         coefficients = np.array(
             [offset, viscous, saturating, turn, falling, drop, fading, start,
@@ -332,7 +332,7 @@ class _Dictionary:
 def weights(gram: Array, right: Array, ridge: float, signed: int = 1) -> Array:
     """Weights of columns with these products, by least squares with a ridge.
 
-    None is negative but those of the first `signed` columns, by default of the offset's.
+    Only those of the first `signed` columns, by default the offset, may be negative.
     """
     from scipy.optimize import nnls  # slow to import
 
@@ -340,7 +340,7 @@ def weights(gram: Array, right: Array, ridge: float, signed: int = 1) -> Array:
     scale[scale <= 0] = 1.0
     root = np.linalg.cholesky(gram / scale[:, None] / scale + ridge * np.eye(len(right))).T
     target = np.linalg.solve(root.T, right / scale)
-    # The signed columns once more, reversed.
+    # The signed columns are added once more with opposite sign.
     both, _ = nnls(np.c_[root, -root[:, :signed]], target, maxiter=50 * len(right))
     found: Array = both[: len(right)]
     found[:signed] -= both[len(right) :]

@@ -1,4 +1,4 @@
-"""Options of a fit: the user's choices, and every constant that shapes its result."""
+"""Options of a fit: the user's choices, and every constant that affects its result."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ Method = Literal["equation_error", "output_error"]
 Eccentricity = Literal["off", "on", "auto"]
 # When incremental encoders were set to zero: before all recordings, or at the start of each.
 EncoderReference = Literal["auto", "shared", "per_recording"]
-# Of SciPy's robust losses those that keep growing, so that a start far away still comes near.
+# SciPy's robust losses without an upper limit, so that a distant start still converges.
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 
 CHOICES = {
@@ -26,8 +26,8 @@ class FitOptions:
     """Settings of a fit.
 
     The fields up to `fit_delay` are the user's, see `nfriction.fit`; the others are tuning
-    constants with their reasons. Lengths and speeds are in m for sliding joints. A `..._term` is
-    the bound of a plant term and the standard deviation of its prior, both around the given plant.
+    constants with their reasons. For sliding joints lengths are in m. A `..._term` is the bound of
+    a plant term and the standard deviation of its prior, both around the given plant.
 
     Raises:
         ValueError: if a choice does not exist, or two exclude each other.
@@ -45,59 +45,59 @@ class FitOptions:
     fit_delay: bool = False
 
     # --- Data.
-    # Faster over its first sample, a recording does not begin at rest [rad/s]; an encoder that
-    # flickers by one count at 500 Hz seems to move at 0.2 rad/s.
+    # A recording that is faster over its first sample does not begin at rest [rad/s]; an encoder
+    # that flickers by one count at 500 Hz seems to move at 0.2 rad/s.
     rest_speed: float = 0.3
-    # An encoder that was just set to zero may flicker by some of its counts [rad].
+    # An encoder that was just set to zero may flicker by a few counts [rad].
     zero_reading: float = 2e-3
-    # Below so many counts, quantisation is most of a joint's apparent motion.
+    # Below this number of counts, quantisation is most of a joint's apparent motion.
     min_counts: int = 10
-    # A sample is a spike if it is off its neighbours by so many times the 99 % quantile.
+    # A sample is a spike if its distance from both neighbours is this many times the 99 % quantile.
     spike_ratio: float = 20.0
-    # Steps of one nominal rate differ by less than the first, a quartz's error with room; rates
-    # chosen to differ do so by more than the second.
+    # Steps of one nominal rate differ by less than the first (the error of a quartz, with a
+    # margin), those of deliberately different rates by more than the second.
     clock_error: tuple[float, float] = (1e-3, 0.05)
-    # A mistake is named if its correction leaves half of the unexplained torque, a quarter of its
-    # power: errors of a rig's data within their bounds change it by less.
+    # A mistake is reported if its correction halves the unexplained torque, a quarter of its power:
+    # errors of a rig's data within their bounds change it by less.
     diagnosis_ratio: float = 2.0
-    # Corrections that leave so much more than the best are not distinguished from it.
+    # Corrections that leave at most this many times as much as the best are not distinguished.
     diagnosis_tie: float = 1.25
-    # Torques are averaged over so long, short against a swing [s], and so many samples are used.
+    # Averaging time of torques, short compared with a swing [s], and number of samples used.
     diagnosis_block: float = 0.03
     diagnosis_samples: int = 8_000
-    # Pieces of a recording, each left out in turn to find how far friction changes with time, and
-    # the chance at which a joint's constant friction is said to change.
+    # Pieces of a recording, each left out in turn to find the scatter of a change of friction, and
+    # the chance that constant friction is reported as changing.
     drift_pieces: int = 10
     drift_chance: float = 1e-3
-    # Rise of the energy of a free motion over its largest kinetic energy; inertias that are off by
-    # their bound feign 0.43.
+    # Rise of the energy of a free motion over its largest kinetic energy; inertias at their bound
+    # produce an apparent rise of 0.43.
     energy_rise: float = 0.5
-    # Longest delay between torques and positions: some samples of a slow bus [s].
+    # Longest delay between torques and positions: several samples of a slow bus [s].
     largest_delay: float = 0.1
-    # More substeps would mean a sign function too steep for the sample time.
+    # A sign function that needs more substeps is too steep for the sample time.
     max_substeps: int = 8
 
     # --- Equation error.
-    # Smoothers know less at the ends of a record, so this much of each is dropped [s].
+    # Smoothers are less accurate at the ends of a record, so this much of each is dropped [s].
     edge: float = 0.02
-    # Ridge relative to the data's information: none where the data are informative, and no runaway
-    # where they are not (an offset and a sign that never changes).
+    # Ridge relative to the data's information: negligible if the data are informative, and no
+    # divergence if they are not (an offset and a sign that never changes).
     ridge: float = 1e-6
-    # Share of the torque attributed to friction even where no law explains any of it.
+    # Share of the torque attributed to friction even if no law explains any of it.
     min_explained: float = 0.01
 
     # --- Terms of the plant.
-    # Inertia and gravity terms of a bench are known to about a tenth; bound as in the data cards.
+    # Inertia and gravity terms of a bench are known to about 10 %; bounds as in the data cards.
     ratio_term: tuple[float, float] = (0.3, 0.1)
     # Lengths between joints come from a drawing or a ruler.
     length_term: tuple[float, float] = (0.1, 0.01)
     # The zero of an encoder is known to about a degree [rad].
     angle_term: tuple[float, float] = (0.1, 0.02)
-    # A disc sits on its shaft within some hundredths of a millimetre, at a radius of 1 cm [rad].
+    # A disc of 1 cm radius is centred on its shaft within a few hundredths of a millimetre [rad].
     eccentricity_term: tuple[float, float] = (0.02, 0.002)
-    # Torque constants of two drives of a kind differ by up to a tenth.
+    # Torque constants of two drives of the same type differ by up to 10 %.
     gain_term: tuple[float, float] = (0.3, 0.1)
-    # A gear stage loses some hundredths of the torque, a worm much more.
+    # A gear stage loses a few percent of the torque, a worm gear much more.
     loss_term: tuple[float, float] = (0.5, 0.05)
     # Bias of a current sensor over the largest torque; the prior is narrow because, with dry
     # friction, an offset and a wrong zero of an angle are nearly equivalent.
@@ -106,14 +106,14 @@ class FitOptions:
     asymmetry_term: tuple[float, float] = (1.0, 0.1)
     # Drag of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
     drag_term: tuple[float, float] = (1.0, 0.05)
-    # Buses and filters delay a torque by some ms; the bound is `largest_delay` [s].
+    # Buses and filters delay a torque by a few ms; the bound is `largest_delay` [s].
     delay_sd: float = 0.02
-    # How far the last link extends into the air is rarely measured: lower, upper, sd [link length].
+    # The length of the last link in the air is rarely measured: lower, upper, sd [link length].
     reach_term: tuple[float, float, float] = (-0.7, 1.0, 0.3)
 
     # --- Shooting problem.
-    # Initial states come from a smoother and are off by far less; their prior only prevents a
-    # window from running away [rad, rad/s].
+    # Initial states from a smoother are far more accurate; their prior only prevents a window from
+    # diverging [rad, rad/s].
     start_sd: tuple[float, float] = (0.01, 0.3)
     # At rest: about the quantisation error. A free initial velocity would absorb the friction
     # while the links break loose.
@@ -124,49 +124,50 @@ class FitOptions:
     # --- Search.
     gradient_tolerance: float = 1e-6
     step_tolerance: float = 1e-8
-    # Relative decrease that ends a search whose result is only a start for the next.
+    # Relative decrease that ends a search whose result only starts the next one.
     loose_tolerance: float = 1e-4
-    # Searches with a robust loss: each takes its scale from the errors of the one before, and they
-    # end where it moves by less than this share.
+    # Searches with a robust loss: each takes its scale from the errors of the previous one, until
+    # the scale changes by less than this fraction.
     most_scales: int = 5
     scale_tolerance: float = 0.05
     # Decrease of the cost that ends the last search: a tenth in log likelihood.
     loglik_tolerance: float = 0.1
-    # Dry friction puts kinks into the cost along which steps creep; so many in a row that gain no
-    # more than their tolerance end a search.
+    # Dry friction puts kinks into the cost along which steps creep; this number of consecutive
+    # steps that gain no more than their tolerance ends a search.
     patience: int = 3
     # Divergent windows keep lowering the cost long after the shared parameters have converged:
-    # stop when these move by less than so many sd, `patience` times in a row.
+    # stop when these move by less than this many sd, `patience` times in a row.
     settled_move: float = 0.05
     # Error of typical models before a fit has measured it [rad].
     first_noise: float = 1e-3
-    # Smaller errors are rounding [rad].
+    # Smaller errors are round-off [rad].
     min_noise: float = 1e-9
-    # Growth of the error from one horizon to the next that means a search lost the motion.
+    # Growth of the error from one horizon to the next at which a search has lost the motion.
     max_growth: float = 10.0
 
-    # Chance that a stage is called worse at a shorter horizon by its noise alone.
+    # Chance that noise alone makes a stage appear worse at a shorter horizon.
     loss_level: float = 0.01
-    # Residuals up to so many times the encoder's rounding leave no room for a better minimum.
+    # Residuals below this multiple of the encoder's rounding leave no room for a better minimum.
     explained_ratio: float = 1.1
-    # Search for the states of windows at given parameters: few unknowns, close by.
+    # Search for the states of windows at given parameters: few unknowns with a close start.
     settling_steps: int = 6
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
-    # Every so many-th window is held out at once, so that all sizes of the motion are represented.
+    # Every `folds`-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
-    # Chance that what counts as a gain on windows held out is their scatter: one standard error for
-    # a network, which its prior keeps near its law.
+    # Chance that scatter counts as a gain on hold-out windows: one standard error for a network,
+    # which its prior keeps near its law.
     gain_chance: float = 0.16
-    # And of a further input, which is a new term of the law and one of several that are tried.
+    # The same for a further input, which is a new term of the law and one of several candidates.
     input_chance: float = 0.05
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
-    # Updates of the priors of a network's groups by evidence; each searches on from the last.
+    # Evidence updates of the priors of a network's groups; each search starts from the previous
+    # one.
     evidence_updates: int = 3
-    # Log ratio of evidences that is worth mentioning: half the logarithm of 10 (H. Jeffreys,
-    # Theory of Probability, 3rd ed. 1961, appendix B).
+    # Log ratio of evidences that is substantial: half the logarithm of 10 (H. Jeffreys, Theory of
+    # Probability, 3rd ed. 1961, appendix B).
     evidence_gain: float = 0.5 * math.log(10.0)
 
     # --- Extrapolation prior of a network.
@@ -177,26 +178,26 @@ class FitOptions:
     point_spacing: int = 5
     # Deviation expected at unvisited points, in units of the coefficients' scale.
     unvisited_sd: float = 0.2
-    # Quantiles of the acceleration that bound a network's inputs; the rest are outliers.
+    # Quantiles of the acceleration that bound a network's inputs; beyond them are outliers.
     acceleration_quantiles: tuple[float, float] = (0.001, 0.999)
-    # Reference of a coefficient that is to remain zero, in units of its scale: above rounding,
+    # Reference of a coefficient that is to remain zero, in units of its scale: above round-off, but
     # without effect on a simulation.
     zero_reference: float = 1e-6
 
     # --- Autocorrelation of the residuals.
-    # Counted samples within a correlation time, and the most that are skipped: a network leaves
-    # shorter correlations than its constant law.
+    # Samples used per correlation time, and the maximum decimation: the residuals of a network have
+    # shorter correlations than those of its constant law.
     samples_per_correlation: int = 8
     max_decimation: int = 20
-    # Stretches within which residuals count as stationary, in correlation times, and their least
-    # length in samples: shorter ones say too little about the correlation within them.
+    # Segments within which residuals are taken to be stationary, in correlation times, and their
+    # smallest length in samples: shorter ones show too little of the correlation within them.
     stationary_times: float = 20
     min_stationary: int = 500
-    # Lags of the spectral density, in correlation times, and their least share of a stretch.
+    # Lags of the spectral density, in correlation times, and their smallest share of a segment.
     lag_times: float = 20
     min_lag_share: float = 0.1
-    # Share of the motion's power that its bandwidth holds, and the harmonics of it that friction
-    # and inertia add.
+    # Share of the motion's power within its bandwidth, and the harmonics of it that friction and
+    # inertia add.
     band_power: float = 0.999
     band_harmonics: int = 2
 
@@ -218,7 +219,7 @@ class FitOptions:
             if value not in allowed:
                 raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
         object.__setattr__(self, "windows", checked_lengths("windows", self.windows))
-        # Any text would count as true.
+        # Any text would be true.
         for name in ("fit_plant", "drag", "fit_delay"):
             value = getattr(self, name)
             if value not in ((True, False, None) if name == "drag" else (True, False)):
@@ -237,16 +238,16 @@ class FitOptions:
 
 
 def checked_lengths(name: str, given: object, least: int = 1) -> tuple[float, ...]:
-    """Lengths of windows [s]: so many at least, finite and positive."""
+    """Lengths of windows [s], finite and positive, at least `least` of them."""
     try:
-        # Texts are no lengths, though Python converts some to numbers.
+        # Texts are not lengths, although Python converts some to numbers.
         lengths = tuple(float(1.0 * w) for w in given)  # type: ignore[attr-defined]
     except TypeError:
         lengths = (math.nan,)
     if len(lengths) < least or not all(0 < w < math.inf for w in lengths):
         raise ValueError(
-            f"`{name}` must be positive lengths [s] such as (0.5, 2.0), got {given!r}; a single "
-            f"one is (2.0,)."
+            f"`{name}` must be positive lengths [s] such as (0.5, 2.0), got {given!r}; write a "
+            f"single one as (2.0,)."
         )
     return lengths
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.options import DEFAULTS, FitOptions
 
-# Least squared frequency at which a chain swings for its weight to matter [1/s^2].
+# Squared frequency of a swing below which the weight of a chain does not matter [1/s^2].
 WEIGHS = 1e-3
 
 
@@ -26,13 +26,13 @@ def plant_parameters(
 
     Args:
         plant: `PendulumChain` or `LinearAxis`.
-        driven: joints with a measured torque. Without one, a free swing determines only ratios,
-            so the first gravity term is kept as the scale.
+        driven: joints with a measured torque. Without any, a free swing determines only ratios,
+            so the first gravity term is fixed as the scale.
         largest_torque: largest torque in the recordings [N m; N]; bounds its offset.
         largest_rate: largest velocity in the recordings [m/s]; scale of an axis' asymmetry.
-        drag: fit air drag on the links: one quadratic coefficient for all; of several links also
-            a linear one, and how far the last reaches into the air.
-        eccentricity: fit the eccentricity of the encoders, two numbers a link.
+        drag: fit air drag on the links: one quadratic coefficient for all; with several links also
+            a linear one, and the length of the last link in the air.
+        eccentricity: fit the eccentricity of the encoders, two numbers per link.
         options: bounds and priors.
 
     Returns:
@@ -42,12 +42,12 @@ def plant_parameters(
     """
     buffers = dict(plant.named_buffers())
     found = [*_chain_terms(buffers, bool(driven), options)] if "inertia_coupling" in buffers else []
-    # Without torque a mass alone is only the scale of the friction.
+    # Without torque a single mass only sets the scale of the friction.
     for name in ("armature", "mass") if driven else ("armature",):
         for j in range(buffers[name].shape[-1] if name in buffers else 0):
             found += _ratio(buffers, f"{name} {j + 1}", _at(buffers, name, j), options.ratio_term)
-    # All gains together are only the scale of the masses, so the first is kept; not with an arm,
-    # whose inertia is kept.
+    # All gains together only set the scale of the masses, so the first is fixed; with an arm, its
+    # inertia is fixed instead.
     for j in driven[0 if "arm_inertia" in buffers else 1 :] if "torque_gain" in buffers else ():
         unit = _at(buffers, "torque_gain", j)
         found += _ratio(buffers, f"torque gain {j + 1}", unit, options.gain_term)
@@ -84,7 +84,7 @@ def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:
 
 
 def has_weight(gravity_moment: Tensor, inertia_coupling: Tensor) -> bool:
-    """True if the pose of a chain matters to gravity: not balanced, nor in a horizontal plane."""
+    """True if gravity depends on a chain's pose: neither balanced nor in a horizontal plane."""
     own = inertia_coupling.diagonal(dim1=-2, dim2=-1)
     return bool((gravity_moment.abs() > WEIGHS * own).any())
 
@@ -100,7 +100,7 @@ def _chain_terms(
 
     weight = has_weight(buffers["gravity_moment"], buffers["inertia_coupling"])
     for i in range(links):
-        # Without torque and gravity, the inertia is the scale of the friction.
+        # Without torque and gravity, the inertia only sets the scale of the friction.
         if driven or weight:
             name = f"inertia {i + 1}{i + 1}"
             yield from _ratio(buffers, name, coupled((i, i)), options.ratio_term)
@@ -109,7 +109,7 @@ def _chain_terms(
     for j in range(0 if driven and weight else 1, links):
         moment = _at(buffers, "gravity_moment", j) | coupled(*((i, j) for i in range(j)))
         yield from _ratio(buffers, f"gravity {j + 1}", moment, options.ratio_term)
-    # Without weight lengths are only the scale of these.
+    # Without weight, lengths only set the scale of these.
     for i in range(links - 1) if weight else ():
         carried = coupled(*((i, j) for j in range(i + 1, links)))
         yield from _ratio(buffers, f"length {i + 1}", carried, options.length_term)
@@ -122,8 +122,8 @@ def _chain_terms(
 
 def _drag_terms(buffers: Mapping[str, Tensor], options: FitOptions) -> Iterator[PlantParameter]:
     length = buffers["length"]
-    # On a single link, linear drag is viscous friction of the joint, and the reach only the scale
-    # of the quadratic drag.
+    # On a single link, linear drag is viscous friction of the joint, and the reach only sets the
+    # scale of the quadratic drag.
     for name in ("drag_linear", "drag_quadratic") if len(length) > 1 else ("drag_quadratic",):
         unit = {name: torch.ones_like(buffers[name])}
         yield _amount(buffers, name.replace("_", " "), unit, options.drag_term)
@@ -146,7 +146,7 @@ def _at(
 def _ratio(
     buffers: Mapping[str, Tensor], name: str, change: dict[str, Tensor], term: tuple[float, float]
 ) -> Iterator[PlantParameter]:
-    """A relative change; none where all entries that it scales are zero."""
+    """A relative change; none if all entries that it scales are zero."""
     bound, sd = term
     if any(bool((buffers[buffer] * chosen).any()) for buffer, chosen in change.items()):
         yield PlantParameter(name, change, -bound, bound, sd, ratio=True)
@@ -155,7 +155,7 @@ def _ratio(
 def _amount(
     buffers: Mapping[str, Tensor], name: str, change: dict[str, Tensor], term: tuple[float, float]
 ) -> PlantParameter:
-    """A term whose whole value is at least zero and at most the bound."""
+    """A term whose total value lies between zero and the bound."""
     ((buffer, unit),) = change.items()
     given, (most, sd) = buffers[buffer][unit > 0], term
     low, high = 0.0 - float(given.min()), max(most - float(given.max()), 0.0)

@@ -1,8 +1,8 @@
-"""Fuzzy rules by which friction on a table follows what the table records, see `NFSlip`.
+"""Fuzzy rules that make friction follow inputs recorded in a table, see `NFSlip`.
 
-The torque is linear in all rules, so that ridge regression of what the law leaves gives them, with
-the prior of networks. An input is taken where blocks left out gain by it, beyond their scatter. The
-period of a ripple is that at which the rows' error has most power over position.
+The torque is linear in all rules, so that ridge regression on the law's residual gives them, with
+the prior of networks. An input is used if it improves hold-out blocks by more than their scatter.
+The period of a ripple is that at which the rows' error has most power over position.
 """
 
 import math
@@ -25,15 +25,15 @@ from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]
 
-# Fewest periods of a ripple in the range of the motion: fewer are an arc of the position.
+# Fewest periods of a ripple in the range of the motion: fewer are a slow function of position.
 FEWEST_PERIODS = 10
-# Spatial frequencies over that at which the range of the motion has a period more.
+# Spacing of spatial frequencies, relative to one more period in the range of the motion.
 SPACING = 1 / 6
-# Smallest change of the torque by which a law is scaled back.
+# Lower bound of the rules' factor on the law when a torque is divided by it.
 LEAST = 0.1
-# Shifts of the phase of a ripple that are tried, over a period.
+# Number of trial shifts of a ripple's phase over a period.
 SHIFTS = 24
-# Cells of a position, at least, in the shortest period: within one the phase turns by an eighth.
+# Fewest cells of position in the shortest period: in one cell the phase turns by an eighth.
 CELLS = 8
 
 
@@ -47,14 +47,14 @@ def recorded_inputs(joint: JointTorque) -> dict[str, Tensor]:
 
 
 class Rules:
-    """Fuzzy rules of a joint, to be fitted beside its law.
+    """Fuzzy rules of a joint, to be fitted in addition to its law.
 
     Args:
         schedule: of one joint; it gets the ranges of its inputs, and the rules by `set`.
         joint: rows in order of time.
         found: the law's fit to them.
-        blocks: rows that are left out in turn.
-        v_smooth: velocity within which the direction turns [rad/s; m/s].
+        blocks: rows that are held out in turn.
+        v_smooth: width of the smoothed direction [rad/s; m/s].
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Rules:
         fastest = float(inputs["velocity"].abs().max())
         if joint.q is not None:
             inputs["ripple"] = inputs["velocity"]
-        # Both directions alike.
+        # Symmetric in both directions.
         ends = {"direction": (-v_smooth, v_smooth), "ripple": (-fastest, fastest)}
         self.sets: dict[str, Array] = {}
         for k, name in enumerate(TERMS):
@@ -85,18 +85,18 @@ class Rules:
             self.sets.pop("ripple", None)
 
     def noise_of(self, error: Array) -> float:
-        """Noise that leaves such an error, with its autocorrelation [N m; N]."""
+        """Noise level of an error, inflated for its autocorrelation [N m; N]."""
         return max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
 
     def chosen(self, found: MemoryFit) -> tuple[list[str], Array]:
-        """Inputs that blocks left out gain by, and the squared errors there, (block,)."""
+        """Inputs that improve hold-out blocks, and the squared errors there, (block,)."""
         names: list[str] = []
         now = self._left_out(found, names)
         while others := [name for name in self.sets if name not in names]:
             trials = {name: self._left_out(found, [*names, name]) for name in others}
             best = min(trials, key=lambda name: float(trials[name].sum()))
             fell = now - trials[best]
-            # What few blocks show is not seen again in other recordings.
+            # Gains in only a few blocks do not recur in other recordings.
             error = fell.std(ddof=1) / len(fell) ** 0.5
             least = student_quantile(len(fell) - 1, 1 - DEFAULTS.input_chance) * error
             if fell.mean() <= max(least, (1 - (1 - TOLERANCE) ** 2) * now.mean()):
@@ -107,7 +107,7 @@ class Rules:
 
     @torch.no_grad()
     def set(self, names: Sequence[str], torque: Array) -> None:
-        """Set the rules of inputs beside a law's torque, (row,)."""
+        """Set the rules of inputs, given a law's torque, (row,)."""
         wave = self.ripple.wave() if self.ripple else 1.0
         x = self._columns(names, torque, wave)
         solution: NDArray[Any] = self._weights(x, self.joint.tau - torque)
@@ -150,16 +150,16 @@ class Rules:
 def fit_recorded(
     schedule: Recorded, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
 ) -> MemoryFit:
-    """Fit the law and set the rules that blocks left out gain by.
+    """Fit the law and set the rules that improve hold-out blocks.
 
     Args:
         schedule: of one joint; it gets the rules.
         joint: rows in order of time.
-        blocks: rows that are left out in turn.
-        v_smooth: velocity within which the direction turns [rad/s; m/s].
+        blocks: rows that are held out in turn.
+        v_smooth: width of the smoothed direction [rad/s; m/s].
 
     Returns:
-        Fit of the law, with the torque that the rules make of it and their errors on the blocks.
+        Fit of the law, with the torque and the errors on the blocks that result with the rules.
     """
     found = fit_slip(joint, blocks, loaded=False)
     rules = Rules(schedule, joint, found, blocks, v_smooth)
@@ -173,7 +173,7 @@ def fit_recorded(
             with torch.no_grad():
                 return schedule.corrected(torch.tensor(torque)[:, None], inputs).numpy()[:, 0]
 
-        # The law once more, to the torque without what the rules explain, and they by what is left.
+        # The law is fitted again to the torque without the rules' part, and they to its residual.
         ripple, both = (corrected(np.full(len(joint), x)) for x in (0.0, 1.0))
         alone = (joint.tau - ripple) / np.maximum(both - ripple, LEAST)
         found = fit_slip(replace(joint, tau=alone), blocks, loaded=False)
@@ -190,7 +190,7 @@ def ripple_shift(
 ) -> float:
     """Shift of the positions at which a ripple explains a run better than by chance [rad; m].
 
-    Another zero of the encoder puts the ripple out of phase; 0 where the run does not show one.
+    A different encoder zero puts the ripple out of phase; 0 if the run shows no such shift.
 
     Args:
         schedule: of one joint.
@@ -217,8 +217,8 @@ class _Ripple(NamedTuple):
 
     Attributes:
         waves: radians of the ripple per unit of position, (frequency,).
-        sums: of the error times the speed and a wave, (block, direction, frequency).
-        squares: of the speed, (block, direction).
+        sums: of error times speed times wave, (block, direction, frequency).
+        squares: sums of squares of the speed, (block, direction).
     """
 
     waves: Array
@@ -231,9 +231,9 @@ class _Ripple(NamedTuple):
     ) -> "_Ripple | None":
         assert joint.q is not None
         reach = range_of(joint)
-        # A period has at least a row at the highest speed.
+        # A period has at least one row at the highest speed.
         most = reach / float(np.abs(np.diff(joint.q)).max())
-        # Zeros behind the range make the spacing of the transform that of the frequencies.
+        # Zero padding gives the transform the spacing of the frequencies.
         kept = np.arange(round(FEWEST_PERIODS / SPACING), math.ceil(most / SPACING))
         waves = np.asarray(2 * np.pi * SPACING / reach * kept, dtype=np.float64)
         cells = 2 ** math.ceil(math.log2(CELLS * max(most, 1.0)))
@@ -243,7 +243,7 @@ class _Ripple(NamedTuple):
         for k, block in enumerate(blocks):
             for i, sign in enumerate((1.0, -1.0)):
                 rows = block[sign * joint.qd[block] > 0]
-                # Ripple grows with speed, and each direction has a phase of its own.
+                # The ripple grows with speed, and each direction has its own phase.
                 speed = np.abs(joint.qd[rows])
                 squares[k, i] = speed @ speed
                 dealt = np.bincount(cell[rows], speed * error[rows], cells + 1)

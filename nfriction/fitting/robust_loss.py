@@ -1,4 +1,4 @@
-"""Robust losses: samples far off, such as spikes of a sensor, count less than their square.
+"""Robust losses: outliers, such as spikes of a sensor, count less than their square.
 
 With z = (error / scale)^2, a sample costs scale^2 rho(z) / 2 in place of error^2 / 2, and its
 weight in the normal equations is rho'(z). Names and definitions are those of
@@ -20,19 +20,19 @@ from torch import Tensor
 from nfriction.fitting.options import Loss
 from nfriction.recording import Recording
 
-# Scales over the standard deviation of normal noise at which an estimate needs 5 % more samples
-# than least squares do; without outliers little is lost.
+# Scales in standard deviations of normal noise at which an estimate without outliers needs 5 % more
+# samples than least squares.
 EFFICIENT: dict[Loss, float] = {"soft_l1": 1.287, "huber": 1.345, "cauchy": 2.385}
 # Median of the absolute value of a standard normal variable.
 MEDIAN = 0.6745
-# Below such a weight a sample is named.
+# Samples with a smaller weight are named.
 NAMED_BELOW = 0.5
 
 
 class Outliers(NamedTuple):
-    """Successive samples of a joint that a robust loss counts less than half.
+    """Consecutive samples of a joint to which a robust loss gives less than half weight.
 
-    `first` and `last` are times [s], `weight` is the least one.
+    `first` and `last` are times [s], `weight` is the smallest one.
     """
 
     recording: str
@@ -48,7 +48,7 @@ class Outliers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RobustLoss:
-    """A loss by name, and the error from which on it counts less than the square, (joint,)."""
+    """A loss by name, and the error above which it grows less than the square, (joint,)."""
 
     name: Loss
     scale: Tensor
@@ -57,13 +57,13 @@ class RobustLoss:
     def of_errors(cls, name: Loss, errors: Tensor, least: float) -> "RobustLoss":
         """The loss with the scale of errors (sample, joint), from their median.
 
-        Their standard deviation counts as `least` or more.
+        Their standard deviation is taken to be at least `least`.
         """
         sd = errors.abs().median(0).values / MEDIAN
         return cls(name, EFFICIENT[name] * sd.clamp_min(least))
 
     def is_near(self, other: "RobustLoss", tolerance: float) -> bool:
-        """True where the scales differ by no more than this share."""
+        """True if the scales differ by no more than this fraction."""
         return bool((self.scale / other.scale - 1).abs().max() <= tolerance)
 
     def weight(self, errors: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ SQUARES = RobustLoss("linear", torch.ones(()))
 
 
 def named_outliers(recording: Recording, weight: np.ndarray) -> Iterator[Outliers]:
-    """Stretches of samples with a weight (sample, joint) below a half."""
+    """Runs of consecutive samples with a weight (sample, joint) below a half."""
     for name, column in zip(recording.names, weight.T, strict=True):
         low = np.concatenate([[False], column < NAMED_BELOW, [False]])
         turns = np.flatnonzero(low[1:] != low[:-1])
@@ -103,12 +103,12 @@ def named_outliers(recording: Recording, weight: np.ndarray) -> Iterator[Outlier
 
 
 def outlier_warning(outliers: Sequence[Outliers]) -> tuple[str, ...]:
-    """The stretches in a sentence, the three that count least by name."""
+    """The outliers in a sentence, with the times of the three of smallest weight."""
     if not outliers:
         return ()
     least = sorted(outliers, key=lambda o: o.weight)
     more = f" and {len(least) - 3} more" if len(least) > 3 else ""
     return (
-        f"The robust loss counts samples less than half: {'; '.join(map(str, least[:3]))}{more} "
-        "(`outliers`); errors of the sensor or, where they are many, of the model.",
+        f"The robust loss gives less than half weight to {'; '.join(map(str, least[:3]))}{more} "
+        "(`outliers`): errors of the sensor or, if there are many, of the model.",
     )

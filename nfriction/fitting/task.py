@@ -55,10 +55,10 @@ class FitTask:
         start: an earlier fit to start from.
         callback: called with a stage name after every step; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
-        delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
+        delay: of the torque after the positions from the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
         mistakes: likely mistakes in recordings or plant.
-        unmodelled: of `data_warnings`, changes of friction and play that no model here has.
+        unmodelled: those of `data_warnings` on changes of friction and play, which no model has.
     """
 
     model: FrictionModel
@@ -89,7 +89,7 @@ def prepare_task(
     plant = rigs.of(plant)
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
-    # Before much time is spent on recordings.
+    # Checked before much time is spent on recordings.
     modelled = as_model(model, plant.joints).joints
     given = as_recording_list(recordings, plant)
     joint = in_joint_coordinates(plant, given, modelled)
@@ -105,7 +105,7 @@ def prepare_task(
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     guessed = (
         options.encoder_reference == "auto"
-        # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
+        # Torques depend too little on a constant offset of the encoders to estimate one.
         and options.method == "output_error"
         and looks_zeroed_per_recording(plant, given, options)
     )
@@ -115,16 +115,16 @@ def prepare_task(
     if options.fit_delay:
         if not largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
-        # A search by simulation finds the delay only from nearby: within a cycle of the motion.
+        # A search by simulation finds the delay only from a start within a cycle of the motion.
         delay, _ = balanced_delay(plant, joint, moved, options)
     advanced = advanced_torques(joint, delay)
-    # With the delay removed, so that it is not named a second time as a mistake.
+    # With the delay removed, so that it is not reported again as a mistake.
     stated, mistakes = likely_mistakes(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
     named = mistake_warning(stated, mistakes)
     for sentence in named:
-        # A fit to such data may last minutes, and would say so only at its end.
+        # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
     of = plant, advanced, moved, options
     unmodelled = () if mistakes else (*changing_friction(*of), *loose_loads(*of))
@@ -142,7 +142,7 @@ def prepare_task(
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:
-    """Constant coefficients that torques imply on a plant; see `fit_equation_error`."""
+    """Constant coefficients implied by the torques on a plant; see `fit_equation_error`."""
     recordings = advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
         steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond
@@ -160,7 +160,7 @@ def constant_prior(
 def known_terms(
     start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
 ) -> Tensor:
-    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
+    """Plant terms of an earlier fit by name, (term,); 0 if missing, except the delay."""
     known = {TORQUE_DELAY: delay}
     if start is not None:
         known |= {name: value for name, value, _ in start.plant_terms}

@@ -32,9 +32,9 @@ from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.recording.torque_table import JointTorque, TorqueTable
 
-# The sign of the velocity turns within this share of the largest velocity, or within `V_SMOOTH`.
+# Width of the smoothed sign as a share of the largest velocity; at most `V_SMOOTH`.
 TURN_SHARE = 0.01
-# Share of the torques by which starts differ that another start than the fit's has to explain.
+# Share of the difference between starts that another start than the fit's has to explain.
 START_SHARE = 0.25
 
 
@@ -68,21 +68,21 @@ class JointFit:
 
     @property
     def note(self) -> str:
-        """Recorded inputs that the friction follows, behind a semicolon; empty for none."""
+        """Recorded inputs that the friction follows, after a semicolon; empty for none."""
         own = self.model.schedule
         return f"; follows {own.described(0)}" if isinstance(own, Recorded) and self.rules else ""
 
     @torch.no_grad()
     def steady(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
-        """Torque at motions (row,), and its standard deviation by that of the parameters [N m]."""
+        """Torque at motions (row,), and its sd due to that of the parameters [N m]."""
         torque, slopes = torque_and_slopes(self.model, qd, qdd, load)
-        # Without information a coefficient may be anything; the band shows the others.
+        # Coefficients without information are arbitrary; the band shows the others.
         root = torch.where(self.root.isfinite(), self.root, 0.0)
         return torque, (slopes @ root).norm(dim=-1)
 
 
 def turning_velocity(table: TorqueTable) -> float:
-    """Velocity within which the sign of the velocity turns, for all joints of a table."""
+    """Width of the smoothed sign of the velocity, for all joints of a table."""
     slowest = min(float(np.abs(joint.qd).max()) for joint in table.joints)
     return min(V_SMOOTH, TURN_SHARE * slowest)
 
@@ -92,7 +92,7 @@ def fit_joint(
 ) -> JointFit:
     """Constant coefficients of the law of a named model, by least squares within bounds.
 
-    A neuro-fuzzy model is its constant law after that; see `fit_network`.
+    A neuro-fuzzy model then equals its constant law; see `fit_network`.
 
     Raises:
         ValueError: if there are too few rows, or the law needs a load that the table lacks.
@@ -151,7 +151,7 @@ def fit_network(
     noise = max(effective_noise(error), 1e-12 * float(tau.abs().max()))
     stride = decimation(error, options)
     qd, qdd, load, tau = (x[::stride] for x in (qd, qdd, load, tau))
-    # Rows that are left out would have weighed as much as those that stay.
+    # Rows that are left out would have had the same weight as those that stay.
     precision = stride / noise**2
     mean, sd = model.schedule.prior()
     weight = (share * sd).pow(-2)
@@ -196,12 +196,12 @@ def fit_memory(
         )
     if joint.time is None:
         raise ValueError(
-            f"{plain_name(name)} remembers the motion before, and {joint.name} has no column time; "
-            "add one, or leave the model out."
+            f"{plain_name(name)} depends on the preceding motion, but {joint.name} has no column "
+            "time; add one, or leave the model out."
         )
     if range_of(joint) == 0.0:
         raise ValueError(
-            f"column q of {joint.name} does not change, and laws with memory, such as "
+            f"column q of {joint.name} does not change, but laws with memory, such as "
             f"{plain_name(name)}, need motion; give its positions, or a table without q."
         )
     require_load(name, joint)
@@ -209,7 +209,7 @@ def fit_memory(
     if "sigma_0" in model.law.names:
         found = fit_bristles(model.law, joint, blocks)
         if not found.presliding:
-            # A stiff joint explains the rows as well: they hold no presliding.
+            # A stiff joint explains the rows equally well: they contain no presliding.
             unknown = (f"sigma_0 of {joint.name}",)
     elif schedule.form == "recorded":
         found = fit_recorded(cast("Recorded", schedule), joint, blocks, v_smooth)
@@ -246,8 +246,8 @@ def predict(model: FrictionModel, joint: JointTorque, lead_in: float = LEAD_IN) 
     Args:
         model: of one joint.
         joint: rows; in order of time for a law with memory.
-        lead_in: time from the first row [s] whose torque shows a law with memory how far it was
-            deflected before; 0 begins without deflection.
+        lead_in: time from the first row [s] from whose torque the initial deflection of a law with
+            memory is estimated; 0 starts undeflected.
     """
     require_load(type(model).__name__, joint, model)
     if model.law.memory is not None:
@@ -274,7 +274,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
         return states_along(memory, state, moved[rows], load[rows], held, steps[rows])
 
     still = torch.zeros(1, 1, memory.size).double()
-    # A table to predict may have no torque, which then shows nothing.
+    # A table to predict may have no torque to estimate the start from.
     seen = lead_in if bool(tau.isfinite().all()) else 0.0
     first = slice(int(np.searchsorted(joint.time, joint.time[0] + seen)))
     if first.stop:
@@ -290,13 +290,13 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
         torque = memory.torque(states, speed, force, coefficients[0])
         rmse = (tau[first] - torque).square().mean(0).sqrt()
         best = int(rmse.argmin())
-        # Noise at rest must not choose a start that later rows of the fit would contradict.
+        # Noise at rest must not select a start that contradicts later rows of the fit.
         spread = torque.mean(0).max() - torque.mean(0).min()
         best = best if rmse[best] + START_SHARE * spread < rmse[0] else 0
         still = starts[best][None]
         fading = float(coefficients[0, names.index("d_r")]) if "d_r" in names else 0.0
         if fading > 1e-6 * reach:
-            # Friction that the elements do not show is the excess of a long rest.
+            # Friction that the elements do not explain is the excess after a long rest.
             left = torch.exp(-(moved[first].abs() * steps[first, None]).cumsum(0) / fading)[:, 0]
             error = (tau[first] - torque)[:, best]
             still[..., -1] = left @ error / left.square().sum()
@@ -310,7 +310,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
 def torque_and_slopes(
     model: FrictionModel, qd: Tensor, qdd: Tensor, load: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Torque at motions (row,), and its derivative by the model's parameters, (row, parameter)."""
+    """Torque at motions (row,), and its derivatives in the parameters, (row, parameter)."""
     qd, qdd, load = (x[:, None] for x in (qd, qdd, load))
     with torch.no_grad():
         coefficients = model.coefficients(qd, qdd).expand(*qd.shape, -1).clone()
@@ -325,7 +325,7 @@ def torque_and_slopes(
 
 
 def join(models: Sequence[FrictionModel]) -> FrictionModel:
-    """One model of many joints from as many models of one joint, of the same kind."""
+    """One model of several joints from models of one joint each, all of the same kind."""
     first = models[0]
     make: Any = type(first)
     joined: FrictionModel = make(len(models), v_smooth=first.v_smooth, **first.schedule.options())
@@ -335,16 +335,16 @@ def join(models: Sequence[FrictionModel]) -> FrictionModel:
 
 
 def require_load(name: str, joint: JointTorque, model: FrictionModel | None = None) -> None:
-    """Raise ValueError where the law of a model reads a load that the table lacks."""
+    """Raise ValueError if the law of a model reads a load that the table lacks."""
     if joint.load is None and reads_load(model or model_by_name(name)(1)):
         raise ValueError(
-            f"{name} takes the load, and {joint.name} has no column load; add one, or leave the "
+            f"{name} needs the load, but {joint.name} has no column load; add one, or leave the "
             "model out."
         )
 
 
 def reads_load(model: FrictionModel) -> bool:
-    """True where the steady torque of a model of one joint depends on the load."""
+    """True if the steady torque of a model of one joint depends on the load."""
     qd, load = torch.ones(2, 1).double(), torch.tensor([[0.0], [1.0]]).double()
     units = torch.ones(2, 1, len(model.law.names)).double()
     torque = model.steady_torque(qd, load, units)
@@ -352,7 +352,7 @@ def reads_load(model: FrictionModel) -> bool:
 
 
 def _columns(joint: JointTorque) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Velocity, acceleration, load (1 where there is none) and torque, each (row, 1)."""
+    """Velocity, acceleration, load (1 if there is none) and torque, each (row, 1)."""
     load = np.ones_like(joint.qd) if joint.load is None else joint.load
     qd, qdd, load_, tau = (torch.tensor(x)[:, None] for x in (joint.qd, joint.qdd, load, joint.tau))
     return qd, qdd, load_, tau
@@ -363,7 +363,7 @@ def _range(joint: JointTorque, options: FitOptions) -> tuple[float, list[float]]
     along = joint.qdd * np.sign(joint.qd)
     low, high = np.quantile(along, options.acceleration_quantiles)
     if not low < high:
-        # Constant velocities have no acceleration to follow.
+        # At constant velocities there is no acceleration.
         low, high = low - 1.0, high + 1.0
     return float(np.abs(joint.qd).max()), [float(low), float(high)]
 
@@ -371,7 +371,7 @@ def _range(joint: JointTorque, options: FitOptions) -> tuple[float, list[float]]
 def _scale(model: FrictionModel, joint: JointTorque) -> Tensor:
     """Size of each coefficient that alone would explain a third of the torque, (1, coefficient).
 
-    Zero where the torque is not linear in the coefficient.
+    Zero for nonlinear coefficients.
     """
     qd, qdd, load, tau = _columns(joint)
     coefficients = model.coefficients(qd, qdd).detach().expand(*qd.shape, -1).clone()

@@ -93,7 +93,7 @@ class Schedule(nn.Module, ABC):
         return state
 
     def advance_loaded(self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> Tensor:
-        """The same under a load, which moves the state of a sampled law alone."""
+        """Hidden state after a sample with a load, on which only that of a sampled law depends."""
         return self.advance(qd, qdd, state)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
@@ -159,7 +159,7 @@ class Schedule(nn.Module, ABC):
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
 
     def belief(self) -> tuple[Tensor, Tensor] | None:
-        """The prior that intervals take, wider than that of a fit; None: that of the fit."""
+        """The prior used for intervals, wider than that of a fit; None for that of the fit."""
         return None
 
     @abstractmethod
@@ -240,7 +240,7 @@ class Tabulated(Schedule):
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
-        # Bounds that meet keep a coefficient; solvers need no other way to leave one out.
+        # Equal bounds fix a coefficient, so that solvers need no other way to exclude one.
         fitted = torch.tensor(self.fitted_mask, device=values.device)
         lower, upper = (
             torch.where(fitted, limit, values).reshape(-1)

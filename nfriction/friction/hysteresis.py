@@ -1,26 +1,26 @@
-"""Friction with hysteresis for tables of torque: slip elements beside terms of the velocity.
+"""Friction with hysteresis for tables of torque: slip elements plus terms in the velocity.
 
 The torque is
 
     tau_f = f_o + F_v qd + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k) + r,
 
 with s = 1, or the load. Each element follows the displacement up to its width d_k and then slips,
-z_k = clip(z_k + qd time_step / d_k, -1, 1). What a long rest before the first sample has added to
-the friction is the state r, zero unless an observer sets it; it fades over the path d_r travelled,
-r exp(-|qd| time_step / d_r). The elements begin undeflected, or, where an observer knows no better,
-as after a move of p_0, with which the rows of the fit began.
+z_k = clip(z_k + qd time_step / d_k, -1, 1). The excess friction after a long rest before the first
+sample is the state r, zero unless an observer sets it; it fades over the path d_r travelled,
+r exp(-|qd| time_step / d_r). The elements begin undeflected or, if an observer has no better
+estimate, as after a displacement of p_0, with which the rows of the fit began.
 
-The torque is linear in all forces, so that least squares estimates them at given widths. Without
-elements it is a law of the velocity alone. No force is negative: each element stores and
-dissipates, and over a closed path the offset does no work. Only the drop F_d may give back energy,
-at most what the narrowest element stores.
+The torque is linear in all forces, so that least squares estimates them for given widths. Without
+elements it is a law of the velocity alone. No force is negative: each element stores and dissipates
+energy, and over a closed path the offset does no work. Only the drop F_d may return energy, at most
+that stored in the narrowest element.
 
-`NFSlip` lets it follow what a table records besides the motion,
+`NFSlip` lets the torque follow further quantities recorded in a table,
 
     (1 + sum_i n_i(x_i)) tau_f + a(qd) cos(2 pi q / P) + b(qd) sin(2 pi q / P),
 
 with x_i load, temperature, position q and direction, and the ripple of a motor or gear over the
-position. n_i, a and b are fuzzy rules, zero where blocks left out do not gain by them.
+position. n_i, a and b are fuzzy rules, zero if they do not improve hold-out blocks.
 
 References:
     F. Al-Bender, V. Lampaert and J. Swevers, IEEE Trans. Automatic Control 50 (2005) 1883-1887
@@ -41,17 +41,17 @@ from nfriction.friction.models import ConstantModel, NamedModel
 from nfriction.fuzzy import Anfis
 
 ELEMENTS = 12
-# Fuzzy sets of each input that friction may follow, and of the velocity, of either direction, that
-# the amplitude of a ripple follows: as many as of other networks.
+# Number of fuzzy sets of each input that friction may follow, and of the signed velocity that the
+# amplitude of a ripple follows: as many as in other networks.
 TERMS = {"load": 5, "temperature": 5, "position": 5, "direction": 2, "ripple": 9}
-# Places of the coefficients: those of the velocity first, then forces and widths of the elements.
+# Indices of the coefficients: first terms of the velocity, then forces and widths of the elements.
 OFFSET, VISCOUS, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIRST = range(9)
 
 
 def advance_hysteresis(
     state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
-    """Deflections over their widths, clipped where elements slip, and the rest's excess."""
+    """Deflections over their widths, clipped where elements slip, and the excess of a rest."""
     count = state.shape[-1] - 1
     path = (qd * time_step).unsqueeze(-1)
     # Places are written out here and below, as TorchScript takes no global.
@@ -123,10 +123,10 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
 
 
 def unused(values: Mapping[str, float]) -> set[str]:
-    """Names of coefficients that add nothing: smallest forces, what shapes their terms, no rest."""
+    """Names of coefficients without effect: negligible forces, shapes of their terms, no rest."""
     shapes = {"f_a": "v_a", "F_d": "v_s"} | {f"F_{k}": f"d_{k}" for k in range(1, ELEMENTS + 1)}
     found = {force for force in shapes if values[force] < 2.0 * SMALLEST}
-    # An excess that is gone over a thousandth of the narrowest element is none.
+    # An excess that fades within a thousandth of the narrowest element does not count.
     at_once = values["d_r"] < 1e-3 * values["d_1"]
     return found | {shapes[force] for force in found} | ({"d_r"} if at_once else set())
 
@@ -148,7 +148,7 @@ class LoadSlip(ConstantModel):
 
 
 class Recorded(Constant):
-    """Constant coefficients, and fuzzy rules of what a table records; see this module.
+    """Constant coefficients, and fuzzy rules for quantities recorded in a table; see this module.
 
     Attributes:
         layers: rules of each input: relative change of the torque by its sets, or the ripple's
@@ -203,7 +203,7 @@ class Recorded(Constant):
         return ((x - low) / (high - low)).clamp(0.0, 1.0).unsqueeze(-1)
 
     def corrected(self, torque: Tensor, given: Mapping[str, Tensor]) -> Tensor:
-        """Torque of the law with what it follows, (row, joint) [N m; N].
+        """Torque of the law corrected for the recorded inputs, (row, joint) [N m; N].
 
         Args:
             torque: of the law alone.
@@ -231,13 +231,13 @@ class Recorded(Constant):
 
 
 class NFSlip(NamedModel):
-    """Slip elements whose friction follows recorded columns by fuzzy rules, for tables alone."""
+    """Slip elements whose friction follows recorded columns by fuzzy rules, for tables only."""
 
     definition = SLIP
     make_schedule = Recorded
 
     def check_loads(self, plant: object) -> None:
-        """Refuse all that records no such columns: simulations and controllers."""
+        """Refuse simulations and controllers, which have no such columns."""
         assert isinstance(self.schedule, Recorded)
         if followed := self.schedule.followed():
             raise ValueError(

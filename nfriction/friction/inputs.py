@@ -23,8 +23,8 @@ INPUTS = {
 def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
     """A law with further inputs.
 
-    `f + F_t sgn(qd)^2` by direction, `f + F_n load sgn(qd)` by load; `exp(-k_h h)` times all of it
-    by the heat h, which is a hidden state of the coefficients (`nfriction.friction.heat`).
+    Direction gives `f + F_t sgn(qd)^2`, load `f + F_n load sgn(qd)`; heat multiplies the result by
+    `exp(-k_h h)`, with h a hidden state of the coefficients (`nfriction.friction.heat`).
 
     Raises:
         ValueError: for an input that does not exist or is repeated.

@@ -87,7 +87,7 @@ class Memory:
     """Internal state of a law; `nfriction.friction.memory` has the contract and such laws.
 
     Attributes:
-        size: numbers a joint.
+        size: of each joint's state.
         advance: `(state, qd, load, coefficients, time_step) -> state` over a sample.
         torque: `(state, qd, load, coefficients) -> tau_f` at the end of a sample.
         transmitted: the load is the torque that the drive transmits [N m], no normal load.
@@ -114,9 +114,9 @@ class Law:
         coefficients: in the order of the coefficients' last axis.
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable; of a law
             with memory the steady torque, approached at a constant velocity.
-        nested_law: a simpler law that this one contains: the torque is the same where all
-            coefficients but `nested_coefficients` are zero, or only shape such a term. A law with
-            several minima is also fitted from where its nested law's fit ended.
+        nested_law: a simpler law that this one contains: the torque is the same if all
+            coefficients except `nested_coefficients` are zero, or only shape a zero term. A law
+            with several minima is also fitted from the end of its nested law's fit.
         nested_coefficients: names, here, of the nested law's coefficients, in its order.
         memory: internal state of a law whose torque depends on more than the present motion; None
             of a law without.

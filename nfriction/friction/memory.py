@@ -1,4 +1,4 @@
-"""Friction laws with memory: the torque depends on an internal state that the motion moves.
+"""Friction laws with memory: the torque depends on an internal state driven by the motion.
 
 Below breakaway the contact of a joint yields like a spring: the torque follows the displacement
 (*presliding*), with hysteresis, before it follows the velocity (*sliding*). A law with memory
@@ -17,14 +17,15 @@ of
     time_step     length of the sample [s], a number or shaped like `qd`
     tau_f         friction torque at the end of the sample [N m], (*batch, joint)
 
-A sample is advanced first, then its torque is read; the first state is zero, no deflection. The
-update is the exact solution for a velocity that is held, so that it is stable at any stiffness and
-time step, a joint at rest keeps its state (no drift), and cutting a sample in two changes nothing.
+A sample is advanced first, then its torque is read; the initial state is zero, undeflected. The
+update is the exact solution for a held velocity, so that it is stable at any stiffness and time
+step, a joint at rest keeps its state (no drift), and splitting a sample in two changes nothing.
 
-Every law here is passive, sampled or not: the work `tau_f qd time_step` is at least what the
-deflection stores, for all states, velocities, time steps and positive coefficients. For bristles
-with damping that takes a limit: with the steady friction g(v) the damping is at most 2 g(v) / |v|.
-A constant one injects energy where it exceeds `sigma_2 F_c / F_d` (Barahanov and Ortega).
+Every law here is passive, in continuous time and sampled: the work `tau_f qd time_step` is at least
+the energy stored in the deflection, for all states, velocities, time steps and positive
+coefficients. For bristles this requires a limit on damping: at most 2 g(v) / |v| with the steady
+friction g(v). Constant damping injects energy if it exceeds `sigma_2 F_c / F_d` (Barahanov,
+Ortega).
 
 `Law.torque` of such a law is its steady torque, approached at a constant velocity.
 
@@ -101,7 +102,7 @@ def deflections(
 
 
 def reference_coefficients(model: FrictionModel) -> Tensor:
-    """Constants that deflections are measured by: a network's are those from which it deviates."""
+    """Constants to which deflections refer: for a network those from which it deviates."""
     return [*model.schedule.coefficient_sets().values()][-1].clone()
 
 
@@ -112,15 +113,15 @@ def load_of(law: Law, plant: Any, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
 
 
 def load_at_rest(law: Law, qd: Tensor) -> Tensor:
-    """Load that a law reads at rest, shaped like `qd`: 1 of a joint, no torque of its drive."""
+    """Load that a law reads at rest, shaped like `qd`: 1, or zero drive torque."""
     return torch.zeros_like(qd) if law.reads_drive else torch.ones_like(qd)
 
 
 def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
-    """Largest state in size: of a contact that slips slowly, (*batch, joint, state)."""
+    """Largest state by magnitude, that of a contact that slips slowly, (*batch, joint, state)."""
     ahead = torch.ones_like(coefficients[..., 0])
     start = ahead.new_zeros((*ahead.shape, memory.size))
-    # Far, at a velocity below that of any Stribeck curve.
+    # After a long path at a velocity below that of any Stribeck curve.
     return memory.advance(start, 1e-9 * ahead, ahead, coefficients, 1e15 * ahead).abs()
 
 
@@ -144,7 +145,7 @@ def holding_share(model: FrictionModel, torque: Tensor) -> tuple[Tensor, Tensor]
 
 
 def growth(x: Tensor) -> Tensor:
-    """Share `(1 - exp(-x)) / x` of a held input that a decaying state keeps, 1 at x = 0."""
+    """Share `(1 - exp(-x)) / x` of a held input that a decaying state retains, 1 at x = 0."""
     # The quotient cancels at small x, where four terms of its series are exact to rounding.
     series = 1.0 - x * (1 / 2 - x * (1 / 6 - x / 24))
     return torch.where(x < 1e-3, series, (1.0 - torch.exp(-x)) / x.clamp(min=1e-3))
@@ -169,7 +170,7 @@ def bristle_torque(
         coefficients: sigma_0, sigma_1 and sigma_2 on the last axis.
     """
     stiffness, damping, viscous = coefficients.unbind(-1)
-    # The energy that damping may give back at most equals what slipping dissipates.
+    # Damping may return at most the energy that slipping dissipates.
     most = 2.0 * steady / (qd.abs() * slipping.abs().clamp(min=1.0)).clamp(min=1e-12)
     return stiffness * z + torch.minimum(damping, most) * (1.0 - slipping) * qd + viscous * qd
 
@@ -275,7 +276,7 @@ def advance_elasto_plastic(
     elastic, settled = _elastic_range(qd, coefficients)
     path = qd.abs() * time_step
     direction = torch.sign(qd)
-    # Along the motion; what is deflected against it lies below the elastic limit.
+    # Along the motion; a deflection against it lies below the elastic limit.
     y = state.select(-1, 0) * direction
     stretch = torch.minimum((elastic - y).clamp(min=0.0), path)
     moved, path = y + stretch, path - stretch
@@ -459,8 +460,8 @@ class ElastoPlastic(ConstantModel):
     definition = ELASTO_PLASTIC
 
 
-# The stiffness stays constant under a network: energy stored at one is given back at another. What
-# friction dissipates may follow the motion, so that these are passive like their laws.
+# With a network the stiffness stays constant, because energy stored at one stiffness would be
+# returned at another. Dissipation may follow the motion, so that these are passive like their laws.
 
 
 class NFDahl(NamedModel):

@@ -72,7 +72,7 @@ class FrictionModel(nn.Module):
         """
         if not torch.jit.is_scripting():
             qd, qdd, load = as_tensor("qd", qd), as_tensor("qdd", qdd), as_tensor("load", load)
-        # A single velocity would broadcast to all joints' coefficients without a word.
+        # A single velocity would silently broadcast to all joints' coefficients.
         width = qd.shape[-1] if qd.ndim else 0
         if width != self.joints:
             raise ValueError(
@@ -123,7 +123,7 @@ class FrictionModel(nn.Module):
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
-        It decides whether an explicit integrator is stable near standstill. Where several sets of
+        It determines whether an explicit integrator is stable near standstill. If several sets of
         coefficients are possible at rest, it is the largest; for a law with memory, whose steps are
         implicit and stable at any slope, it is zero.
         """
@@ -186,7 +186,7 @@ class ConstantModel(NamedModel):
 
 
 class NCFM(ConstantModel):
-    """Viscous friction `C_p qd`, one constant a joint (second paper, Table I)."""
+    """Viscous friction `C_p qd`, one constant per joint (second paper, Table I)."""
 
     definition = laws.VISCOUS
 
@@ -210,12 +210,12 @@ class CVFM(ConstantModel):
 
 
 class NLFM(ConstantModel):
-    """Five constants f_o, f_c, f_v, f_a, f_b a joint (second paper, Table III)."""
+    """Five constants f_o, f_c, f_v, f_a, f_b per joint (second paper, Table III)."""
 
     definition = laws.NONLINEAR
 
 
 class Stribeck(ConstantModel):
-    """Generalised Stribeck friction with constants F_c, F_d, F_v, v_s, delta a joint."""
+    """Generalised Stribeck friction with constants F_c, F_d, F_v, v_s, delta per joint."""
 
     definition = laws.STRIBECK

@@ -1,8 +1,8 @@
 """A law with memory at a fixed sample rate, as controllers compute it.
 
-A controller sees the motion at its samples and takes the velocity as held until the next one. The
-law's internal state is then a hidden state of the coefficients, and all that handles such states
-(exports with their init, reset and step, and what they promise for NaN) handles the law.
+A controller gets the motion at its samples and takes the velocity to be held until the next one.
+The law's internal state is then a hidden state of the coefficients, so that everything that handles
+such states (exports with init, reset, step and their NaN policy) also handles the law.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,8 +19,8 @@ from nfriction.friction.parameters import Sensitivity, positive_number
 def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
     """The model of a law with memory as one without, whose coefficients have a hidden state.
 
-    Its coefficients are those of the law and, behind them, its internal state after the sample. The
-    hidden state before a first sample is that of a joint at rest, nothing deflected.
+    Its coefficients are those of the law, followed by its internal state after the sample. The
+    hidden state before a first sample is that of a joint at rest, undeflected.
 
     Args:
         model: of a law with memory, whose coefficients have no hidden state of their own.

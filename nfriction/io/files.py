@@ -1,4 +1,4 @@
-"""Files written whole or not at all, by which alone the package writes; strict JSON, checked."""
+"""Atomic writing of files, used for everything the package writes; strict JSON with checksums."""
 
 import errno
 import hashlib
@@ -17,26 +17,26 @@ _REFUSED = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Give a temporary file that replaces `path` when the block ends without an error.
+    """Provide a temporary file that replaces `path` when the block ends without an error.
 
-    Missing folders are made. Readers see the old file or the new one, never half of one; only a
+    Missing folders are made. Readers see the old file or the new one, never part of one; only a
     killed process leaves its temporary file, hidden and ending in `.part`.
     """
     path = Path(path)
     temporary = path.parent / f".{uuid.uuid4().hex}.part"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Unlike tempfile's, it has the permissions of any new file.
+        # Unlike files from tempfile, it has the usual permissions of a new file.
         temporary.open("xb").close()
         yield temporary
         with temporary.open("rb+") as file:
-            # Else a power failure could leave the new name with no content.
+            # Otherwise a power failure could leave the new name without content.
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
         raise OSError(error.errno, _message(error, path), str(path)) from error
     finally:
-        with suppress(OSError):  # the folder may be none, or read-only by now
+        with suppress(OSError):  # the folder may be gone or read-only by now
             temporary.unlink()
 
 
@@ -67,22 +67,22 @@ def parse_json(
 
 
 def checked_json(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The content as JSON has it, with a checksum by which `is_intact` finds it unchanged.
+    """The content as plain JSON, with a checksum for `is_intact`.
 
-    TypeError or ValueError where it is no plain JSON, or has numbers that are not finite.
+    TypeError or ValueError if it is not plain JSON, or has numbers that are not finite.
     """
-    # Through JSON, so that the checksum is of what a reader will see.
+    # Through JSON, so that the checksum covers what a reader will see.
     plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))
     return plain | {"checksum": _checksum(plain)}
 
 
 def is_intact(content: dict[str, Any]) -> bool:
-    """True for content as `checked_json` made it; takes its checksum out."""
+    """True for unchanged content of `checked_json`; removes its checksum."""
     return content.pop("checksum", None) == _checksum(content)
 
 
 def _checksum(content: Mapping[str, Any]) -> str:
-    """SHA-256 of JSON content in any layout."""
+    """SHA-256 of JSON content, independent of its layout."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
@@ -91,7 +91,7 @@ def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
     """Floats of parsed JSON, in its nested lists; `words` such as "nan" count as numbers too."""
     if isinstance(given, (list, tuple)):
         return [numbers(name, x, words) for x in given]
-    # To Python true is a number.
+    # For Python, True is a number.
     if isinstance(given, bool) or not (isinstance(given, (int, float)) or given in words):
         raise ValueError(f"`{name}` must be numbers, got {str(given)[:40]!r}.")
     try:
@@ -101,7 +101,7 @@ def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
 
 
 def shortened(text: object, most: int = 500) -> str:
-    """A message of bounded length, as it may quote a file."""
+    """A message of bounded length, since it may quote a file."""
     whole = str(text)
     return whole if len(whole) <= most else f"{whole[: most - 3]}..."
 
@@ -114,5 +114,5 @@ def _finite(text: str) -> float:
 
 
 def _whole(text: str) -> int:
-    _finite(text)  # arithmetic with floats would overflow on a larger one
+    _finite(text)  # float arithmetic would overflow with a larger one
     return int(text)

@@ -1,8 +1,8 @@
-"""Model files: one JSON file holds the parameters and what is needed to use them safely.
+"""Model files: one JSON file contains the parameters and everything needed to use them safely.
 
-`ModelInfo` is the description beside the parameters: form, units and origin.
+`ModelInfo` is the description stored with the parameters: form, units and origin.
 
-A file is checked for form, size and damage before a model is made of it; no code in it is run.
+A file is checked for form, size and damage before a model is made from it; it contains no code.
 """
 
 import copy
@@ -42,15 +42,15 @@ class ModelInfo:
     Attributes:
         joint_names: in the order of the last axis; empty where joints have no names.
         unit: of a joint's position, `"rad"` or `"m"`.
-        sample_time: of the recordings it was trained on [s]; None where they differ.
-        input_ranges: smallest and largest trained value of each input by joint,
+        sample_time: of the training recordings [s]; None if they differ.
+        input_ranges: smallest and largest training value of each input by joint,
             `{"qd": [[low, high], ...], "qdd": ...}`.
         training_data: digest of each recording, by name.
         rig: the mechanism's parameters, as `Plant.to_dict` gives them.
         fit: how the fit ended.
 
     Raises:
-        ValueError: an entry is of another kind.
+        ValueError: an entry has the wrong type or value.
     """
 
     joint_names: Sequence[str] = ()
@@ -87,9 +87,9 @@ class ModelInfo:
 def parameter_hash(state: Mapping[str, Tensor]) -> str:
     """SHA-256 over names, shapes and values of a model's parameters and buffers."""
     digest = hashlib.sha256()
-    # The order in which a module registers its buffers is no property of the model.
+    # Sorted, because the order in which a module registers its buffers does not matter.
     for name in sorted(state):
-        # In one type on the CPU, so that the device does not change the hash.
+        # As one type on the CPU, so that the device does not change the hash.
         value = state[name].detach().to("cpu", torch.float64).contiguous()
         digest.update(f"{name}{tuple(value.shape)}".encode())
         digest.update(value.numpy().tobytes())
@@ -97,7 +97,7 @@ def parameter_hash(state: Mapping[str, Tensor]) -> str:
 
 
 def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
-    """Everything a model file holds except the parameters, as plain JSON."""
+    """Everything in a model file except the parameters, as plain JSON."""
     if info.joint_names and len(info.joint_names) != model.joints:
         raise ValueError(
             f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
@@ -154,11 +154,11 @@ _ENTRIES: dict[str, type | tuple[type, ...]] = {
 
 
 class ModelFileError(ValueError):
-    """A model file is absent, damaged or no model file."""
+    """A file is absent, damaged or not a model file."""
 
 
 def require_model(model: object) -> None:
-    """Raise TypeError for what is no friction model."""
+    """Raise TypeError if the argument is not a friction model."""
     if not isinstance(model, FrictionModel):
         raise TypeError(
             f"a friction model is needed, got {type(model).__name__}; that of a fit is "
@@ -167,7 +167,7 @@ def require_model(model: object) -> None:
 
 
 def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) -> Path:
-    """Write a model to one JSON file, whole or not at all.
+    """Write a model to one JSON file, atomically.
 
     Args:
         model: a friction model.
@@ -178,7 +178,7 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
         The path.
 
     Raises:
-        TypeError: it is no friction model.
+        TypeError: it is not a friction model.
         ValueError: a parameter is not finite, or `info` is not plain JSON.
         OSError: the file cannot be written.
     """
@@ -199,13 +199,13 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
 def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
     """Read a model file.
 
-    A new model comes without gradients, so that rollouts are compiled. To train it further:
+    A new model has gradients switched off, so that rollouts are compiled. To train it further:
     `model.requires_grad_(True)`.
 
     Args:
         path: file that `save` wrote.
-        into: model to fill, for a law or schedule of one's own; default a new one of the named
-            models. It stays unchanged if the file does not fit, and keeps its gradients.
+        into: model to fill, for a law or schedule of your own; by default a new one of the named
+            models. It stays unchanged if the file does not fit, and keeps its gradient settings.
 
     Returns:
         The model; `load_info` gives its description, `load_plant` the mechanism.
@@ -218,7 +218,7 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
         name, names = content["model"], (*model_names(), *memory_names())
         if into is None and name not in names:
             raise ValueError(
-                f"{shortened(repr(name), 80)} is none of the named models ({', '.join(names)}); "
+                f"{shortened(repr(name), 80)} is not one of the named models ({', '.join(names)}); "
                 "create the model yourself and pass it as `into`."
             )
         model = into
@@ -229,7 +229,7 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
         given, expected = content["state"], model.state_dict()
         if given.keys() != expected.keys():
             odd = shortened(sorted(given.keys() ^ expected.keys()), 80)
-            raise ValueError(f"parameters are missing or not the model's: {odd}.")
+            raise ValueError(f"parameters are missing or do not belong to the model: {odd}.")
         state = {name: _parameter(name, given[name], value) for name, value in expected.items()}
         _check_torque(model, state)
     model.load_state_dict(state)
@@ -247,7 +247,7 @@ def load_info(path: str | Path) -> ModelInfo:
 
 
 def load_plant(path: str | Path) -> Plant:
-    """Read the mechanism that a model was fitted with, fitted plant parameters included.
+    """Read the mechanism that a model was fitted with, including fitted plant parameters.
 
     Raises:
         ModelFileError: the file is absent or damaged, or does not describe the mechanism.
@@ -281,7 +281,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
             raise ValueError("not a file.")
         size = path.stat().st_size
         if size > LARGEST_FILE:
-            raise ValueError(f"{size} bytes are too many for a model file.")
+            raise ValueError(f"it is too large for a model file ({size} bytes).")
         try:
             content = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
@@ -290,7 +290,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
             raise ValueError("not a model file of nfriction.")
         if content.get("schema") != SCHEMA:
             schema = shortened(repr(content.get("schema")), 80)
-            raise ValueError(f"schema {schema} is not {SCHEMA}; another version wrote it.")
+            raise ValueError(f"its schema is {schema}, not {SCHEMA}; another version wrote it.")
         for key, kind in _ENTRIES.items():
             value = content.get(key)
             # JSON's true is an int to Python.
@@ -308,7 +308,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
 
 @contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Raise errors of the block as `ModelFileError` with the file's name."""
+    """Convert errors of the block to `ModelFileError` with the file's name."""
     try:
         yield
     except FileNotFoundError:
@@ -353,14 +353,14 @@ def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
         if trial.state_size:
             found.append(trial.advance(qd, qdd, trial.initial_state(qd, qdd)))
     if not all(x.isfinite().all() for x in found):
-        raise ValueError("with its parameters the model gives no finite torque.")
+        raise ValueError("its parameters give a torque that is not finite.")
 
 
 def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
     try:
         value = torch.tensor(numbers(name, given), dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"parameter `{name}` is no array of numbers.") from error
+        raise ValueError(f"parameter `{name}` is not an array of numbers.") from error
     if value.shape != expected.shape or not torch.isfinite(value).all():
         raise ValueError(
             f"parameter `{name}` must be finite of shape {tuple(expected.shape)}, got shape "

@@ -1,7 +1,7 @@
-"""Public recordings of real mechanisms: fetch the originals, convert them to tables in SI.
+"""Public recordings of real mechanisms: fetch the originals, convert them to tables in SI units.
 
-A commit in a web address fixes the content of an original. The SHA-256 of a converted table is that
-of the table on which the documentation's results were computed.
+The commit in a web address fixes the content of an original. The SHA-256 of a converted table is
+that of the table from which the documentation's results were computed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.signal import savgol_filter
 
 from nfriction.io.files import write_atomically
 
-# By readers of something else, or of part of an original.
+# Errors of the readers for a wrong or incomplete original.
 _NOT_IT = (
     *(AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError),
     *(MatReadError, zlib.error),
@@ -40,7 +40,7 @@ class PublicSet:
     about: str  # mechanism, sensors, authors
     licence: str  # of the originals
     repository: str  # owner and name on GitHub
-    commit: str  # that fixes the content
+    commit: str  # fixes the content
     folder: str  # of the originals in the repository
     source: str  # kind of originals, one of `_CONVERT`
     digits: Mapping[str, str]  # printf format of columns, by the first letters of their names
@@ -54,7 +54,7 @@ class PublicSet:
 
 @dataclass(frozen=True)
 class Fetched:
-    """A set's tables, and the recordings whose tables are not those of the documentation."""
+    """A set's tables, and the recordings whose tables differ from those of the documentation."""
 
     tables: tuple[Path, ...]
     differing: tuple[str, ...]
@@ -71,8 +71,8 @@ def fetch(name: str, folder: Path) -> Fetched:
 
     Args:
         name: of one of `public_sets()`.
-        folder: of the set. Gets `originals`, a table of each recording, and `recordings.csv`, which
-            has initial states where the set gives them.
+        folder: of the set; gets `originals`, a table of each recording, and `recordings.csv`, with
+            initial states if the set has them.
     """
     sets = public_sets()
     if name not in sets:
@@ -114,7 +114,7 @@ def _download(address: str, path: Path) -> None:
 
 
 def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:
-    """A table whose columns have the format of the longest beginning of their names."""
+    """A table whose columns are formatted by the longest matching prefix of their names."""
     columns = []
     for name, values in table.items():
         form = digits[max((key for key in digits if str(name).startswith(key)), key=len)]
@@ -124,10 +124,10 @@ def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:
 
 
 def _multiarm(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:
-    """A block of a free swing; its initial state is of Savitzky and Golay's filter.
+    """A block of a free swing; its initial state comes from a Savitzky-Golay filter.
 
     The authors cut a recording into consecutive pieces of angles and velocities (2 joint, time),
-    first those that they fitted, then those that they checked by.
+    first those for fitting, then those for validation.
     """
     cells = loadmat(path)
     pieces = [piece for key in ("Y_id", "Y_vad") for piece in cells[key].ravel()]
@@ -147,7 +147,7 @@ def _multiarm(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float
 
 
 def _dfki(path: Path, _: str) -> tuple[pd.DataFrame, dict[str, float]]:
-    """A driven run from rest: what the drives measure, and the torques commanded."""
+    """A driven run from rest: measurements of the drives, and the commanded torques."""
     table = pd.read_csv(path)
     names = {"time": "time"}
     for ours, theirs in (
@@ -176,7 +176,7 @@ def _xl330(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:
     table = pd.DataFrame({"time": time, "q1": log["position"]})
     if recording.startswith("drop"):
         return table.assign(tau1=0), {}
-    # The register is a signed number of 16 bits, in 1/885 of the full voltage.
+    # The register is a signed 16-bit number in units of 1/885 of the full voltage.
     duty = log["load"].to_numpy(np.uint16).view(np.int16) / 885
     return table.assign(
         qd1_reg=log["speed"], duty1=duty, volt=log["input_volts"], q_goal1=log["goal_position"],

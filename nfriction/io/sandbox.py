@@ -1,4 +1,4 @@
-"""Worker processes for libraries that a foreign file may crash, hang or corrupt.
+"""Worker processes for libraries that an untrusted file may crash, hang or corrupt.
 
 `run_isolated` starts one and waits for it; `worker_main` is what the worker runs.
 """
@@ -17,7 +17,7 @@ from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any
 
-# Wall time allowed, over processor time: a busy machine is slow.
+# Allowed ratio of wall time to processor time, because a machine may be busy.
 BUSY = 10.0
 _REFUSAL = "refusal.txt"
 # Share of the address space that one written file may take.
@@ -31,7 +31,7 @@ main()
 
 
 class WorkerDied(ValueError):  # noqa: N818 - an exit, as in ProcessLookupError's family
-    """The worker was ended by a signal or an error, or ran out of time."""
+    """The worker was killed by a signal, ended with an error, or ran out of time."""
 
 
 class InvalidFile(ValueError):  # noqa: N818 - it names the finding
@@ -44,7 +44,7 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
     Args:
         module: full name; its `main()` calls `worker_main`.
         task: plain JSON.
-        folder: empty; takes the results and the worker's temporary files.
+        folder: empty; for the results and the worker's temporary files.
         seconds: processor time limit [s], imports included.
     """
     # The worker imports from the same places as this process.
@@ -61,7 +61,7 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise WorkerDied("it does not come to an end") from None
-        # By a file: printed text could come from the library, exit codes cannot hold a message.
+        # A file, because printed text could come from the library, and exit codes have no message.
         refusal = folder / _REFUSAL
         if refusal.exists():
             raise InvalidFile(refusal.read_text(encoding="utf-8", errors="replace"))
@@ -80,7 +80,7 @@ def worker_main(
 
     Args:
         work: function of the task and the folder for results.
-        refusals: its errors that are about the file; `run_isolated` raises them as `InvalidFile`.
+        refusals: its errors that concern the file; `run_isolated` raises them as `InvalidFile`.
         memory: limit of the address space [bytes]; a written file may take a quarter of it.
     """
     request = json.load(sys.stdin)
@@ -94,7 +94,7 @@ def worker_main(
 
 
 def _limit(seconds: float, memory: int) -> None:
-    """Bound processor time and memory where the system can, and never loosen a bound."""
+    """Limit processor time and memory if the system can; never raise an existing limit."""
     try:
         import resource
     except ImportError:
@@ -103,7 +103,7 @@ def _limit(seconds: float, memory: int) -> None:
         resource.RLIMIT_CPU: math.ceil(time.process_time() + seconds),
         resource.RLIMIT_AS: memory,
         resource.RLIMIT_FSIZE: memory // _FILE_SHARE,
-        # A core dump of gigabytes helps nobody.
+        # No core dumps of gigabytes.
         resource.RLIMIT_CORE: 0,
     }
     for kind, bound in bounds.items():

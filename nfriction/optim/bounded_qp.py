@@ -51,9 +51,9 @@ def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def solve_arrowhead(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
-    """Solve a system that is block diagonal from some row on by its Schur complement.
+    """Solve a system that is block diagonal from some row on, by its Schur complement.
 
-    The cost grows with the number of blocks instead of its cube.
+    The cost grows linearly with the number of blocks instead of with its cube.
 
     Args:
         matrix: symmetric, (p, p).
@@ -83,9 +83,9 @@ def solve_arrowhead(matrix: Tensor, right: Tensor, first: int, size: int) -> Ten
 
 # Limit of rounds, times the number of variables; each round activates or releases one bound.
 ROUNDS = 3
-# From so many unbounded variables on it pays to eliminate them once.
+# With at least this many unbounded variables it pays to eliminate them once.
 APART = 400
-# A parameter nearer to a bound than so many roundings is on it.
+# A parameter within this many round-off units of a bound is on it.
 NEAR = 4
 
 # (matrix, right sides, which variables these are) -> solutions.
@@ -95,7 +95,7 @@ Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 def as_bounds(
     x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Both bounds in the shape of `x0`; infinite where there is none.
+    """Both bounds in the shape of `x0`; infinite if there is none.
 
     Raises:
         ValueError: if a shape does not fit, or a lower bound exceeds the upper one.
@@ -114,7 +114,7 @@ def as_bounds(
 
 
 def snap_to_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor:
-    """Within bounds, and on them where only round-off of the step from `before` is between."""
+    """Clamp to the bounds, and to a bound within round-off of the step from `before`."""
     near = NEAR * torch.finfo(x.dtype).eps
     for bound, inside in ((lower, x - lower), (upper, upper - x)):
         there = bound.isfinite() & (inside <= near * torch.maximum(bound.abs(), before.abs()))
@@ -166,7 +166,7 @@ def _active_set(
     system: Tensor, slope: Tensor, low: Tensor, high: Tensor, free: Tensor, solve: Solve
 ) -> Tensor:
     x, free = torch.zeros_like(slope), free.clone()
-    # A multiplier within rounding would release and activate the same bound for ever.
+    # A multiplier within round-off would release and activate the same bound forever.
     rounding = 10 * len(slope) * torch.finfo(slope.dtype).eps
     for _ in range(ROUNDS * len(x)):
         if free.any():
@@ -182,7 +182,7 @@ def _active_set(
         inward &= pull.abs() > rounding * (slope.abs() + system.abs() @ x.abs())
         if not inward.any():
             break
-        # One at a time: after it the others may no longer pull inward.
+        # One at a time, because afterwards the others may no longer pull inward.
         free[torch.where(inward, pull.abs(), -1.0).argmax()] = True
     return x
 
@@ -197,5 +197,5 @@ def _towards(x: Tensor, target: Tensor, low: Tensor, high: Tensor) -> tuple[Tens
         return target, torch.zeros_like(move, dtype=torch.bool)
     hit = share <= least
     reached = torch.where(hit, torch.where(move > 0, high, low), x + least * move)
-    # Rounding may pass a bound that was not the nearest.
+    # Round-off may pass a bound that was not the nearest.
     return reached.clamp(low, high), hit

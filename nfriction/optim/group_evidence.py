@@ -12,10 +12,10 @@ class GroupEvidence(NamedTuple):
     """Evidence for the prior precisions of groups, and better ones.
 
     Attributes:
-        occam: log of the posterior volume over that of the prior, in nats; with the cost at the
-            optimum taken off it is the log evidence, up to a constant.
-        gamma: parameters of each group that the data determine, (groups,).
-        slope: derivative of the log evidence by the log precision of each group, (groups,).
+        occam: log of the posterior volume over that of the prior, in nats; minus the cost at the
+            optimum it is the log evidence, up to a constant.
+        gamma: number of parameters of each group that the data determine, (groups,).
+        slope: derivative of the log evidence in the log precision of each group, (groups,).
         precision: new precision of each group, (groups,).
     """
 
@@ -28,7 +28,7 @@ class GroupEvidence(NamedTuple):
 def group_evidence(
     data: Tensor, known: Tensor, offset: Tensor, groups: Tensor, precision: Tensor
 ) -> GroupEvidence:
-    """MacKay's update of the precisions alpha of groups of parameters beside a known prior.
+    """MacKay's update of the precisions alpha of groups of parameters, given a known prior.
 
     With A = data + known + diag(alpha) at the optimum, the log evidence is stationary where
 
@@ -37,23 +37,23 @@ def group_evidence(
     Args:
         data: curvature of the errors, other variables marginalised, (p, p).
         known: curvature of a prior that does not change, (p, p).
-        offset: parameters less the mean of the prior, at the optimum, (p,).
-        groups: group of each parameter, -1 of those that the known prior alone covers, (p,).
+        offset: parameters minus the mean of the prior, at the optimum, (p,).
+        groups: group of each parameter, -1 for parameters with only the known prior, (p,).
         precision: alpha of each group, (groups,).
     """
     count, mine = len(precision), groups >= 0
     prior = known + torch.diag(torch.where(mine, precision[groups.clamp_min(0)], 0.0))
     variances, volumes = [], []
     for system in (prior, prior + data):
-        # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
+        # Scaled to a unit diagonal, so that the parameters' units do not cost precision.
         scale, factor = factorise(system)
         variances.append(scale.square() * torch.cholesky_inverse(factor).diagonal())
         volumes.append(float(scale.log().sum() - factor.diagonal().log().sum()))
     reduced = (variances[0] - variances[1])[mine]
     squares = group_sums(offset[mine].square(), groups[mine], count)
-    # Rounding may leave less than nothing of a group that the data do not know.
+    # Round-off may make a group about which the data say nothing negative.
     gamma = (precision * group_sums(reduced, groups[mine], count)).clamp_min(0.0)
-    # Data that say nothing cannot choose, and a group at its centre divides by zero.
+    # Uninformative data cannot choose, and a group at its centre would divide by zero.
     usable = (gamma > torch.finfo(gamma.dtype).eps ** 0.5) & (squares > 0)
     return GroupEvidence(
         occam=volumes[1] - volumes[0],
@@ -69,7 +69,7 @@ def factorise(system: Tensor) -> tuple[Tensor, Tensor]:
     scaled = scale[:, None] * system * scale
     factor, failed = torch.linalg.cholesky_ex(scaled)
     if failed:
-        # Singular to rounding: lift the eigenvalues by the size of that rounding.
+        # Singular to round-off: raise the eigenvalues by the size of that round-off.
         lift = 10 * len(system) * torch.finfo(system.dtype).eps
         factor, _ = torch.linalg.cholesky_ex(scaled + lift * torch.eye(len(system)).to(scaled))
     return scale, factor

@@ -41,7 +41,7 @@ class Quadratic:
         cost: half the sum of squared residuals.
         gradient: J^T r, shape (p,).
         hessian: Gauss-Newton J^T J (or any positive semidefinite curvature), shape (p, p).
-        blocks: where the Hessian's last part is block diagonal, its first row and the blocks' size.
+        blocks: if the Hessian's last part is block diagonal, its first row and the blocks' size.
     """
 
     cost: float | Tensor
@@ -57,10 +57,10 @@ class Quadratic:
         )
 
     def checked(self, p: int) -> Quadratic:
-        """The same without gradients of its own.
+        """The model detached from autograd.
 
         Raises:
-            ValueError: if it is not of `p` parameters.
+            ValueError: if it does not have `p` parameters.
         """
         if self.gradient.shape != (p,) or self.hessian.shape != (p, p):
             raise ValueError(
@@ -73,7 +73,7 @@ class Quadratic:
 
 
 class Step(NamedTuple):
-    """An accepted step: cost after it, damping it was taken with, norm of the scaled step.
+    """An accepted step: cost after it, its damping, norm of the scaled step.
 
     `step_norm` is measured in residual units (each parameter times the norm of its Jacobian
     column), so it does not depend on the parameters' units.
@@ -86,16 +86,16 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresResult:
-    """Outcome of a least-squares fit; read `converged` before believing `x`.
+    """Outcome of a least-squares fit; check `converged` before using `x`.
 
     Args:
         x: best parameters, shape (p,).
         cost: half the sum of squares at `x`.
         gradient: at `x`, shape (p,), not projected.
         hessian: Gauss-Newton Hessian at `x`, shape (p, p).
-        status: why the search ended; `message` says it in words.
+        status: reason why the search ended; `message` is the same in words.
         steps: accepted steps.
-        evaluations: costs evaluated, rejected trials included.
+        evaluations: costs evaluated, including rejected trials.
         at_lower, at_upper: which parameters lie on a bound, shape (p,), bool.
         history: one `Step` per accepted step.
     """
@@ -123,12 +123,12 @@ class LeastSquaresResult:
 
 
 def positive_diagonal(diagonal: Tensor) -> Tensor:
-    """1 in place of zeros: a parameter without influence takes any scale."""
+    """1 in place of zeros, since the scale of a parameter without influence is arbitrary."""
     return torch.where(diagonal > 0, diagonal, 1.0)
 
 
 def scaled_spectrum(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """1/sqrt(diagonal), eigenvalues (ascending) and vectors of the matrix of unit diagonal."""
+    """1/sqrt(diagonal), and eigenvalues (ascending) and vectors after scaling to unit diagonal."""
     scale = positive_diagonal(matrix.diagonal()).rsqrt()
     values, vectors = torch.linalg.eigh(scale[:, None] * matrix * scale)
     return scale, values, vectors

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on a local quadratic model, with bounds and the reason of its end.
+"""Levenberg-Marquardt on a local quadratic model, with bounds and the reason for its end.
 
 Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient g = J^T r and its
 Gauss-Newton Hessian H = J^T J. One iteration
@@ -6,10 +6,10 @@ Gauss-Newton Hessian H = J^T J. One iteration
 1. minimises g^T p + 1/2 p^T (H + damping D) p within the bounds, with D the largest diagonal of H
    so far: a strong damping keeps the step p short;
 2. evaluates the cost at x + p, and takes the step only if the cost falls;
-3. lowers the damping where the quadratic predicted the fall well, else raises it.
+3. lowers the damping if the quadratic predicted the decrease well, and raises it otherwise.
 
-The solver asks for cost, gradient and Hessian, not for a residual Jacobian, so that callers may add
-up 40,000 samples in pieces and never hold one. The next step is `nfriction.evaluation.score`.
+The solver needs cost, gradient and Hessian, but not the Jacobian of the residuals, so that callers
+can sum 40,000 samples in pieces without storing it. The next step is `nfriction.evaluation.score`.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ Cost = Callable[[Tensor], Tensor]
 Callback = Callable[[Tensor, Quadratic, Step], Status | None]
 
 # Damping is relative to the (unit) scaled diagonal. Below the least, it no longer keeps round-off
-# from drifting along a singular direction; a rejected step raises it at least to where it begins to
-# matter; beyond the largest, a step is lost in round-off.
+# from drifting along a singular direction; a rejected step raises it at least to the level at which
+# it matters; beyond the largest, a step is lost in round-off.
 LEAST_DAMPING, FELT_DAMPING, LARGEST_DAMPING = 1e-16, 1e-8, 1e16
-# Up to this damping a short step is evidence of a minimum, beyond it only of the damping.
+# Up to this damping a short step indicates a minimum, beyond it only strong damping.
 WEAK_DAMPING = 1.0
 # Factor after a rejected or poor step, divisor after a good one.
 RAISE, LOWER = 4.0, 6.0
@@ -56,8 +56,8 @@ class LevenbergMarquardt:
     Args:
         max_steps: limit of accepted steps.
         gradient_tolerance: largest cosine between the residual and a free Jacobian column.
-        cost_tolerance: relative decrease of the cost, predicted and actual, that counts as none.
-        step_tolerance: step over parameters, both scaled, that counts as none.
+        cost_tolerance: relative decrease of the cost, predicted and actual, that counts as zero.
+        step_tolerance: ratio of step to parameters, both scaled, that counts as zero.
         initial_damping: relative to D; 0 tries a pure Gauss-Newton step first.
     References:
         D. W. Marquardt, SIAM J. Appl. Math. 11 (1963); J. J. Moré, LNM 630 (1978) for the running
@@ -94,11 +94,11 @@ class LevenbergMarquardt:
         Args:
             model: local quadratic at x.
             x0: start, shape (p,); projected into the bounds.
-            cost: half the sum of squares alone, where that is cheaper than `model`; tries steps.
-            lower, upper: bounds, shape (p,) or a number; infinite entries are free.
+            cost: half the sum of squares alone, for trial steps, if cheaper than `model`.
+            lower, upper: bounds, shape (p,) or a number; infinite entries are unbounded.
             callback: called after each accepted step; may end the search with a status.
         Returns:
-            The best point reached and why the search ended there.
+            The best point reached and the reason why the search ended.
         Raises:
             ValueError: if shapes or bounds do not fit, or `cost` and `model` disagree at x0.
         """
@@ -127,10 +127,11 @@ class LevenbergMarquardt:
                     f"`cost(x0)` is {cheap:.9g} but `model(x0).cost` is {own:.9g}; "
                     "both must be half the sum of squared residuals."
                 )
-        # The square of the relative rounding of the residuals.
+        # The square of the relative round-off of the residuals.
         vanished = state.cost * torch.finfo(state.x.dtype).eps ** 2
         while True:
-            # The running maximum keeps a parameter's scale where its influence vanishes on the way.
+            # The running maximum keeps a parameter's scale even if its influence vanishes on the
+            # way.
             state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
             if state.cost <= vanished or state.gradient_cosine() <= self.gradient_tolerance:
                 return "converged_gradient"
@@ -152,7 +153,7 @@ class LevenbergMarquardt:
             weak = state.damping <= WEAK_DAMPING
             short = weak and length <= self.step_tolerance * float((root * state.x).norm())
             decrease = state.attempt(step, length, model, cost)
-            # The prediction counts, too: at a kink the cost may change little far from a minimum.
+            # The prediction also counts: at a kink the cost may change little far from a minimum.
             flat = weak and max(abs(decrease), predicted) <= negligible
             if decrease > 0:
                 gain = decrease / max(predicted, 1e-300)
@@ -161,7 +162,7 @@ class LevenbergMarquardt:
                 elif gain < 0.25:
                     state.raise_damping()
                 return "converged_cost" if flat else "converged_step" if short else None
-            # A step into a region without finite cost is no evidence, however short.
+            # A step into a region without finite cost is not evidence, however short.
             if short and math.isfinite(decrease):
                 return "converged_step"
             if flat:
@@ -183,7 +184,7 @@ class _State:
     history: list[Step] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        # Until the first evaluation nothing is known; an interrupt in it must still find a result.
+        # Unknown until the first evaluation; an interrupt in it must still return a result.
         unknown = self.x.new_full((len(self.x), len(self.x)), torch.nan)
         self.local = Quadratic(math.inf, self.x.new_full(self.x.shape, torch.nan), unknown)
         self.scale = torch.zeros_like(self.x)
@@ -208,7 +209,7 @@ class _State:
         return float(cosines.max()) if len(cosines) else 0.0
 
     def damped_step(self, root: Tensor) -> Tensor:
-        """Minimiser of the damped quadratic within the bounds, of parameters scaled by `root`."""
+        """Minimiser of the damped quadratic within the bounds, in parameters scaled by `root`."""
         system = self.local.hessian / (root[:, None] * root)
         system.diagonal().add_(self.damping)
         low, high = (self.lower - self.x) * root, (self.upper - self.x) * root
@@ -220,8 +221,8 @@ class _State:
         return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
 
     def attempt(self, step: Tensor, length: float, model: Model, cost: Cost | None) -> float:
-        """Move if the cost decreases and all is finite; the decrease (-inf where not finite)."""
-        # A parameter left a rounding error from its bound would never count as frozen.
+        """Move if the cost decreases and all is finite; return the decrease, or -inf."""
+        # A parameter within round-off of its bound would never count as frozen.
         trial = bounded_qp.snap_to_bounds(self.x + step, self.lower, self.upper, self.x)
         self.evaluations += 1
         if cost is not None:

@@ -1,7 +1,7 @@
 """Plants: their common base, and the simplest one, a driven mass on a straight guide.
 
 A plant is a module whose buffers are the constants of M(q) qdd + bias(q, qd) = tau +
-torque_offset, with tau the torque at the joints, behind gears if there are any. Friction is no
+torque_offset, with tau the torque at the joints, after gears if there are any. Friction is not
 part of it: a rollout subtracts friction from tau.
 """
 
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 class Motor:
     """Motors that drive joints through gears: one number for all joints, or one for each.
 
-    Recordings may hold the motors' angles and currents instead of positions and torques of joints,
-    see `Recording.read`.
+    Recordings may contain the motors' angles and currents instead of positions and torques of
+    joints, see `Recording.read`.
 
     Args:
-        gear_ratio: turns of the motor per turn of its joint [-]; of an axis, its angle per way
-            [rad/m]. Negative where it turns the other way.
+        gear_ratio: turns of the motor per turn of its joint [-]; for an axis, motor angle per
+            distance [rad/m]. Negative if they have opposite directions.
         rotor_inertia: of the rotor about its own axis, before the gear [kg m^2].
-        torque_constant: torque of the motor per current, before the gear [N m/A]; None where no
+        torque_constant: torque of the motor per current, before the gear [N m/A]; None if no
             current is read.
 
     Raises:
-        ValueError: for a ratio or constant of zero, a negative inertia, or no numbers.
+        ValueError: for a ratio or constant of zero, a negative inertia, or non-numbers.
     """
 
     gear_ratio: float | Sequence[float] = 1.0
@@ -70,7 +70,7 @@ class Motor:
 class Plant(nn.Module, ABC):
     """Base of the mechanisms; all methods take joint coordinates of shape (*batch, joint).
 
-    A type for hints: fits know which terms of `PendulumChain` and `LinearAxis` they may adjust.
+    Fits can adjust terms of `PendulumChain` and `LinearAxis` only.
 
     Args:
         joints: number of joints.
@@ -79,18 +79,18 @@ class Plant(nn.Module, ABC):
         unit: of a position, "rad" or "m".
         convention: of the angles in its recordings' columns, ("relative" | "absolute",
             "upright" | "hanging"). The methods here always take relative angles from upright.
-        position_quantum: smallest step of the position [rad or m]; None where unknown.
+        position_quantum: smallest step of the position [rad or m]; None if unknown.
         motor: what drives the joints, if known.
     """
 
     kind: ClassVar[str]  # in files
-    required: ClassVar[tuple[str, ...]]  # constructor arguments that a file must hold
+    required: ClassVar[tuple[str, ...]]  # constructor arguments that a file must contain
     optional: ClassVar[tuple[str, ...]]
 
     torque_offset: Tensor
     has_drag: bool = False
     first_link: int = 0
-    # True where `load` is that of each joint's own link, and could be that of its bearing.
+    # True if `load` is that of each joint's own link, and could be that of its bearing.
     has_link_load: bool = False
     _given: dict[str, Any]  # constructor arguments as plain numbers
 
@@ -123,11 +123,11 @@ class Plant(nn.Module, ABC):
         if not isinstance(motor, Motor | None):
             raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
         self.motor = motor
-        _ = self.motor_factors  # fails here unless there is one number for each joint
+        _ = self.motor_factors  # raises unless there is one number for each joint
 
     @property
     def motor_factors(self) -> dict[str, list[float]]:
-        """Position of each joint per motor angle, and its torque per motor current, as known."""
+        """Position of each joint per motor angle, and its torque per motor current, if known."""
         if self.motor is None:
             return {}
         ratio = self.motor.each("gear_ratio", self.joints)
@@ -164,7 +164,7 @@ class Plant(nn.Module, ABC):
         """Fastest decay of velocities [1/s] that slopes (*batch, joint) of friction can cause."""
 
     def replace(self, **buffers: Tensor) -> Self:
-        """A shallow copy with some buffers swapped, the others shared; this plant stays as it is.
+        """A shallow copy with some buffers replaced and the others shared; this plant is unchanged.
 
         Args:
             **buffers: tensors by buffer name. They may carry gradients and extra leading
@@ -172,8 +172,8 @@ class Plant(nn.Module, ABC):
                 goes with `q` of shape (P, W, n).
 
         Raises:
-            ValueError: for a name that is no buffer, or trailing dimensions that differ.
-            TypeError: for a value that is no floating-point tensor.
+            ValueError: for a name that is not a buffer, or trailing dimensions that differ.
+            TypeError: for a value that is not a floating-point tensor.
         """
         own = dict(self.named_buffers(recurse=False))
         for name, value in buffers.items():
@@ -190,7 +190,7 @@ class Plant(nn.Module, ABC):
                 )
         values = {**own, **buffers}
         for name, value in buffers.items():
-            # A module lists each tensor once, but each buffer must be found by its own name.
+            # A module lists each tensor once, but each buffer must be found under its own name.
             if sum(value is other for other in values.values()) > 1:
                 values[name] = value.view_as(value)
         # A deep copy takes shared and replaced objects from its memo.
@@ -202,7 +202,7 @@ class Plant(nn.Module, ABC):
         return clone
 
     def _note_replaced(self, names: Collection[str]) -> None:
-        """Hook of `replace` for terms that are left out while their buffers are zero."""
+        """Hook of `replace` for terms that are omitted while their buffers are zero."""
 
     def _check(self, **states: Tensor) -> None:
         for name, value in states.items():
@@ -228,7 +228,7 @@ class Plant(nn.Module, ABC):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # shown when this plant was built
             fresh = dict(self.from_dict(data).named_buffers())
-        # Only these: a file of untouched arguments stays readable, and follows a new derivation.
+        # Only these, so that a file stays readable and unchanged buffers follow from its arguments.
         changed = {
             name: value.tolist()
             for name, value in self.named_buffers()
@@ -238,7 +238,7 @@ class Plant(nn.Module, ABC):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The plant of `to_dict`, whose `buffers` take the place of derived ones.
+        """The plant of `to_dict`, whose `buffers` replace derived ones.
 
         Raises:
             ValueError: for missing or unknown keys, or values the constructor refuses.
@@ -261,7 +261,7 @@ class LinearAxis(Plant):
     """Equation of motion mass * qdd = tau + torque_offset - asymmetry |qd|, in m and N.
 
     Args:
-        mass: moved mass [kg], the drive's inertia included unless `motor` has it.
+        mass: moving mass [kg], including the drive's inertia unless `motor` has it.
         torque_offset: constant force added to tau [N].
         name, joint_names, position_quantum, motor: see `Plant`.
     """
@@ -331,7 +331,7 @@ class LinearAxis(Plant):
         return kinetic, torch.zeros_like(kinetic)
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Normal load over the load at rest [-]: 1, the guide carries the weight at all times."""
+        """Normal load over the load at rest [-]: 1, since the guide always carries the weight."""
         self._check(q=q, qd=qd)
         return torch.ones_like(q)
 
@@ -370,7 +370,7 @@ def check_keys(
 
 
 def _texts(name: str, values: object) -> tuple[str, ...]:
-    """A list of texts; a single text would silently be taken for its letters."""
+    """A list of texts; a single text would silently become a list of its letters."""
     if not isinstance(values, list | tuple) or not all(isinstance(v, str) for v in values):
         raise ValueError(f"`{name}` must be a list of texts, got {reprlib.repr(values)}.")
     return tuple(values)

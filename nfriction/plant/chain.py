@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Zero in a new chain.
 _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
-# Least gravity [m/s^2], as loads are in units of a link's weight.
+# Smallest gravity [m/s^2], because loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
 
 
@@ -37,7 +37,7 @@ class Arm:
     length: float
 
     def __post_init__(self) -> None:
-        # Without length the chain swings unmoved by the arm, and the mass matrix may be singular.
+        # Without length the arm does not move the chain, and the mass matrix may be singular.
         for name in ("inertia", "length"):
             value = number(f"arm's {name}", getattr(self, name), positive=True)
             object.__setattr__(self, name, value)
@@ -46,14 +46,15 @@ class Arm:
 def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
     if gravity < WEIGHTLESS:
         raise ValueError(
-            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; give that to links "
-            "in a horizontal plane."
+            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; write "
+            f"{WEIGHTLESS:g} for links in a horizontal plane (one such joint alone: a rig of kind "
+            "rotor)."
         )
     if not isinstance(arm, Arm | None):
         raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
     if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
         raise ValueError(
-            '`normal_load` must be "link" or, of a chain on a fixed pivot, "bearing", got '
+            '`normal_load` must be "link" or, for a chain on a fixed pivot, "bearing", got '
             f"{normal_load!r}."
         )
 
@@ -61,7 +62,7 @@ def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
 def _rotor_inertia(
     motor: Motor | None, armature: Sequence[float] | Tensor | None, joints: int
 ) -> Tensor:
-    """Rotor inertia seen at each joint, by the motors or given, (joints,)."""
+    """Rotor inertia seen at each joint, from the motors or as given, (joints,)."""
     rotor = (motor or Motor()).reflected_inertia(joints)
     if armature is not None:
         if rotor.any():
@@ -82,12 +83,12 @@ class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
-    is measured from upright, each further one relative to the link before. Air drag, gears and
+    is measured from upright, each further one relative to the previous link. Air drag, gears and
     eccentric encoders are part of a plant once `replace` sets them. With gears, methods take and
-    give the motors' torques, from which friction is subtracted at the motor side, as a controller
+    return the motors' torques, from which friction is subtracted on the motor side, as a controller
     commands it; tau above is their torque at the joints. With eccentric encoders, inputs and
-    outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over the
-    true angles at that reading.
+    outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` refer to the true
+    angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -97,11 +98,11 @@ class PendulumChain(Plant):
             or (links, 6) columns Ixx, Iyy, Izz, Ixy, Ixz, Iyz, link frame x along the link,
             z the joint axis. Without a free arm only Izz matters.
         gravity: [m/s^2].
-        arm: the rotating arm; None where it is fixed.
+        arm: the rotating arm; None if it is fixed.
         armature: rotor inertia seen at each joint [kg m^2]; None for that of `motor`, if any.
         normal_load: `"link"` for |N|/(m g) of the joint's own link, as in the paper; `"bearing"`
-            for the whole force that the joint carries, of all links beyond it; see `load`.
-        motor: motors and gears of the joints; a rotor's inertia there is seen at its joint.
+            for the total force that the joint carries, from all links beyond it; see `load`.
+        motor: motors and gears of the joints, with the rotors' inertias.
         convention: of the recordings' columns, see `Plant`.
         joint_names, name, position_quantum: see `Plant`.
 
@@ -122,7 +123,7 @@ class PendulumChain(Plant):
         *("convention", "joint_names", "name", "position_quantum"),
     )
 
-    # Constants of the equations; those of a mechanism as given follow from its arguments.
+    # Constants of the equations, which follow from the arguments unless replaced.
     inertia_coupling: Tensor  # a_ij, (links, links) [kg m^2]; only the upper triangle is read
     gravity_moment: Tensor  # g b_i, (links,) [N m]
     armature: Tensor  # (joints,) [kg m^2]
@@ -133,7 +134,7 @@ class PendulumChain(Plant):
     arm_inertia: Tensor
     arm_lever: Tensor
     inertia_tensor: Tensor  # (links, 6) [kg m^2]
-    # Set by `replace` alone: a fit finds them, no user knows them.
+    # Set only by `replace`: a fit estimates them.
     angle_offset: Tensor  # added to q before the geometry is evaluated, (joints,) [rad]
     encoder_cosine: Tensor  # eccentricity, see `dynamics.correct_encoder`, (joints,) [rad]
     encoder_sine: Tensor
@@ -231,7 +232,7 @@ class PendulumChain(Plant):
         mass = dynamics.stack_matrix(
             dynamics.joint_matrix(self._mass(self._geometry(q)), self.first_link)
         )
-        # A single link's does not depend on q, yet has its batch.
+        # That of a single link does not depend on q, but needs its batch shape.
         return mass.expand(np.broadcast_shapes(mass.shape, (*q.shape, self.joints)))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -307,14 +308,14 @@ class PendulumChain(Plant):
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its load at rest [-].
 
-        Of links |N_i| / (m_i g), N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate
+        For links |N_i| / (m_i g), N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate
         qd_i and the link's absolute angle phi_i from upright; 1 for the arm, whose axis is
-        vertical. Of bearings the force that the hinge carries over the weight beyond it, at the
-        acceleration that the motion has without friction and torque.
+        vertical. For bearings the force in the hinge over the weight beyond it, at the acceleration
+        of the motion without friction and torque.
 
         References:
             TLRIP paper, eqs. (26)-(29), with - m g cos phi for + m g cos theta: the printed sign
-            belongs to angles from hanging, and taken literally feeds energy in.
+            belongs to angles from hanging; taken literally, it feeds in energy.
         """
         self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
@@ -324,7 +325,7 @@ class PendulumChain(Plant):
             speed, turn = (dynamics.absolute(x.unbind(-1), 0) for x in (qd, free))
             return dynamics.bearing_load(pose, speed, turn, dynamics.entries(self.load_lever))
         angle = (q + self.angle_offset)[..., self.first_link :].cumsum(-1)
-        # The paper's normal force takes the joint's own rate, not the link's absolute one.
+        # The paper's normal force uses the joint's own rate, not the link's absolute one.
         rate = qd[..., self.first_link :]
         load = (self.load_lever * rate * rate - angle.cos()).abs()
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
@@ -333,9 +334,9 @@ class PendulumChain(Plant):
     def decay_rate(self, damping: Tensor) -> Tensor:
         """Fastest decay of velocities that joint friction can cause in any pose [1/s].
 
-        The largest eigenvalue of M^-1 D over a grid of poses, of at most 5 degrees for one or two
-        turning angles and coarser for more, with D the slopes of friction over velocity at the
-        joint side of gears. Negative slopes count as zero, which bounds it from above.
+        The largest eigenvalue of M^-1 D over a grid of poses, at most 5 degrees apart for one or
+        two turning angles and coarser for more, with D the slopes of friction over velocity on the
+        joint side of gears. Negative slopes count as zero, which gives an upper bound.
 
         Args:
             damping: slope of each joint's friction torque [N m s/rad], (*batch, joint).
@@ -344,11 +345,11 @@ class PendulumChain(Plant):
             Shape (*batch,), the largest over all values of a plant with batches of buffers.
         """
         effective = damping.clamp(min=0.0)
-        # Eigenvalues of infinity are errors of LAPACK; a caller handles infinite rates.
+        # LAPACK raises for infinite entries; a caller handles infinite rates.
         if not effective.isfinite().all():
             return effective.amax(-1)
         rows = effective.reshape(-1, self.joints).to(self.armature)
-        # Friction acts at the motor: its slope reaches the joint by the gear, at most so much.
+        # Friction acts at the motor; the gear multiplies its slope at the joint by at most this.
         gear = self.torque_gain * (1.0 + self.gear_loss)
         found = [fastest_mode(self, gear * row) for row in rows]
         return torch.stack(found).reshape(damping.shape[:-1])
@@ -365,15 +366,15 @@ class PendulumChain(Plant):
         if {"drag_linear", "drag_quadratic"} & set(names):
             if self.first_link:
                 raise ValueError(
-                    "air drag is modelled for a fixed arm only; the sweep of a rotating arm has "
-                    "no part in it. Use a chain without `arm`."
+                    "air drag is modelled only for a fixed arm, without the sweep of a rotating "
+                    "one. Use a chain without `arm`."
                 )
             self.has_drag = True
         if {"encoder_cosine", "encoder_sine"} & set(names):
             self.has_eccentricity = True
         self.has_armature = self.has_armature or "armature" in names
         self.has_gear = self.has_gear or bool({"torque_gain", "gear_loss"} & set(names))
-        # A fit starts at zeros that are about to move.
+        # A fit starts at zeros that will change.
         self._slender = self._slender and "inertia_tensor" not in names
 
     def _corrected(self, q: Tensor) -> dynamics.EncoderCorrection:
@@ -382,7 +383,7 @@ class PendulumChain(Plant):
         )
 
     def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """True angles and rates of readings."""
+        """True angles and rates from encoder readings."""
         if not self.has_eccentricity:
             return q, qd
         corrected = self._corrected(q)
@@ -431,6 +432,6 @@ class PendulumChain(Plant):
             check_keys("arm", arm, ("inertia", "length"))
             data = {**data, "arm": Arm(**arm)}
         plant = super().from_dict(data)
-        # Values of a file have not gone through the constructor.
+        # Values from a file have not been checked by the constructor.
         dynamics.check_gear(plant.torque_gain, plant.gear_loss)
         return plant

@@ -216,7 +216,7 @@ def _mass_beyond(mass: Tensor) -> Tensor:
 
 
 def bearing_lever(mass: Tensor, length: Tensor, com: Tensor) -> Tensor:
-    """Reach [m] by which each link's turning accelerates what a joint carries, (joint, link)."""
+    """Lever [m] by which each link's rotation accelerates the load of a joint, (joint, link)."""
     carried = mass.flip(0).cumsum(0).flip(0)
     own = (static_moment(mass, length, com) / carried[:, None]).triu()
     return own + length.expand_as(own).tril(-1)
@@ -339,16 +339,16 @@ def square_moments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def joint_torque(tau: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
-    """Torque at the joints behind gears, gain (tau - loss |tau| sgn(qd)) [N m], (*batch, joint).
+    """Torque at the joints after gears, gain (tau - loss |tau| sgn(qd)) [N m], (*batch, joint).
 
-    `tau` is the motors' torque with friction subtracted: less of it arrives where the motor drives
-    the joint, more where the joint drives the motor.
+    `tau` is the motors' torque with friction subtracted: less of it arrives if the motor drives the
+    joint, more if the joint drives the motor.
     """
     return gain * (tau - loss * tau.abs() * torch.tanh(qd / SIGN_WIDTH))
 
 
 def motor_torque(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
-    """Torque of the motors that gives `torque` at the joints; inverse of `joint_torque`."""
+    """Motor torque that gives `torque` at the joints; inverse of `joint_torque`."""
     # The efficiency is positive, so the joint torque has the sign of the motor torque.
     efficiency = 1.0 - loss * torque.sign() * torch.tanh(qd / SIGN_WIDTH)
     return torque / (gain * efficiency)
@@ -366,32 +366,32 @@ def check_gear(gain: Tensor, loss: Tensor) -> None:
 
 
 class EncoderCorrection(NamedTuple):
-    """True angle of an encoder's readings, and its first two derivatives by them."""
+    """True angle for an encoder's readings, and its first two derivatives in them."""
 
     angle: Tensor
     slope: Tensor
     curvature: Tensor
 
     def true_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """True acceleration of a reading's rate and acceleration."""
+        """True acceleration from a reading's rate and acceleration."""
         return self.slope * qdd + self.curvature * qd * qd
 
     def read_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The reading's acceleration, of its rate and the true acceleration."""
+        """The reading's acceleration from its rate and the true acceleration."""
         return (qdd - self.curvature * qd * qd) / self.slope
 
 
 def correct_encoder(q: Tensor, zero: Tensor, cosine: Tensor, sine: Tensor) -> EncoderCorrection:
-    """True angles of readings of eccentric encoders.
+    """True angles from readings of eccentric encoders.
 
     A disc off-centre by e in the direction delta reads q + e sin(q + delta). With u the reading
-    from hanging, that is q + c (cos u - 1) + s sin u, zero at hanging, so that it does not mix with
-    the encoder's zero. Taking u of the reading and not of q matters to second order in e only, and
-    gives q in closed form.
+    from hanging, that is q + c (cos u - 1) + s sin u, zero at hanging, so that it is not confounded
+    with the encoder's zero. Computing u from the reading instead of q changes only terms of second
+    order in e, and gives q in closed form.
 
     Args:
         q: readings [rad], (*batch, joint).
-        zero: cosine of each joint's coordinate where the mechanism hangs: -1 for a first link
+        zero: cosine of each joint's coordinate when the mechanism hangs: -1 for a first link
             measured from upright, 1 for the others, (joint,).
         cosine, sine: c and s [rad], (joint,); the eccentricity is e = sqrt(c^2 + s^2).
     """

@@ -1,4 +1,4 @@
-"""Inertia: of links as given by a user, and bounds on a chain's mass matrix over all poses."""
+"""Inertia of links as given by a user, and bounds on a chain's mass matrix over all poses."""
 
 import math
 import warnings
@@ -18,7 +18,7 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
     the matrix entries.
 
     `inertia` is None (point masses), one Izz per link (slender rods: Iyy = Izz, Ixx = 0), or
-    (links, 6) numbers in the order above. Warns where no rigid body has such an inertia.
+    (links, 6) numbers in the order above. Warns if no rigid body can have such an inertia.
     """
     rows = torch.zeros(links, 6, dtype=torch.float64)
     if inertia is None:
@@ -33,7 +33,7 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
             f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for "
             f"(Ixx, Iyy, Izz, Ixy, Ixz, Iyz), got shape {tuple(given.shape)}."
         )
-    # A warning only: identified values absorb what a model leaves out.
+    # Only a warning, because identified values absorb effects that a model omits.
     _warn_impossible(rows)
     return rows
 
@@ -43,7 +43,7 @@ def _warn_impossible(rows: Tensor) -> None:
     xx, yy, zz, xy, xz, yz = rows.unbind(-1)
     matrix = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     small, middle, large = torch.linalg.eigvalsh(matrix).unbind(-1)
-    # A slender rod lies on the border: rounding must not warn.
+    # A slender rod lies on the border: round-off must not cause a warning.
     slack = 1e-9 * rows.abs().amax(-1)
     wrong = (small < -slack) | (large > small + middle + slack)
     if wrong.any():
@@ -51,13 +51,13 @@ def _warn_impossible(rows: Tensor) -> None:
         warnings.warn(
             f"the inertia of link {links} about its mass centre belongs to no rigid body "
             f"(principal inertias must be >= 0 and obey the triangle inequality): "
-            f"{rows[wrong].tolist()}; the motion may still be right where it was identified so.",
+            f"{rows[wrong].tolist()}; if it was identified, the motion may still be right.",
             stacklevel=4,
         )
 
 
-# M^-1 over the grid, behind the values of the buffers that it belongs to. Kept, as every rollout
-# needs it and it costs as much as thousands of compiled steps.
+# Values of the buffers, and M^-1 over the grid for them. Cached, because every rollout needs it and
+# it costs as much as thousands of compiled steps.
 _known: WeakKeyDictionary[Any, tuple[Tensor, Tensor]] = WeakKeyDictionary()
 
 
@@ -68,15 +68,15 @@ def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
     """
     values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
     known = _known.get(plant)
-    # Buffers may be changed in place, so the values decide and not the object.
+    # Buffers may be changed in place, so values are compared and not objects.
     if known is None or not torch.equal(known[0], values):
         mass = plant.mass_matrix(configuration_grid(plant.joints).to(values))
         poses = torch.linalg.inv(mass).reshape(-1, *mass.shape[-3:])
         known = _known[plant] = values, poses
     damping = damping.reshape(-1, 1, plant.joints)
     products = damping.mT * damping
-    # D^1/2 M^-1 D^1/2 has the same eigenvalues, and is symmetric: its Frobenius norm bounds them,
-    # so that few poses need theirs.
+    # D^1/2 M^-1 D^1/2 has the same eigenvalues and is symmetric: its Frobenius norm bounds them, so
+    # that few poses need a decomposition.
     bound = (known[1].square() * products.unsqueeze(1)).sum((-1, -2))
     scale = products.sqrt().expand(len(bound), -1, -1)
     inverse = known[1].expand(len(bound), -1, -1, -1)
@@ -99,7 +99,7 @@ def configuration_grid(joints: int) -> Tensor:
         return torch.zeros(1, 1)
     count = min(72, max(4, 4 * int(20_000 ** (1 / turning) / 4)))
     axis = torch.arange(count, dtype=torch.float64) * (math.tau / count)
-    if turning > 7:  # too many poses: some at random, the straight and the folded one
+    if turning > 7:  # too many poses: random ones, the straight and the folded one
         chosen = torch.randint(4, (2_000, turning), generator=torch.Generator().manual_seed(0))
         chosen[0], chosen[1] = 0, 2
         poses = axis[chosen]
@@ -115,7 +115,7 @@ def require_positive_definite(coupling: Tensor, aligned: Tensor) -> None:
     matrix, so by Schur's product theorem a positive semidefinite `coupling` (a_ij) keeps M so in
     every pose. `aligned` is the links' mass matrix, rotors included, with all links in line.
     """
-    # Point masses may give a singular coupling, with eigenvalues of plus or minus rounding.
+    # Point masses may give a singular coupling, with eigenvalues of plus or minus round-off.
     rounding = 1e-12 * aligned.trace().item()
     smallest = torch.linalg.eigvalsh(aligned)[0].item()
     alone = torch.linalg.eigvalsh(coupling)[0].item()

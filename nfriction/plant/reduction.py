@@ -1,6 +1,6 @@
 """A serial chain of hinged bodies in space as links in one plane, on a pivot or a rotating arm.
 
-Robot descriptions (URDF, MJCF) may hold any mechanism in space; mechanisms that are no
+Robot descriptions (URDF, MJCF) may contain any spatial mechanism; those that are not a
 `PendulumChain` are refused with the name of the joint and the rule.
 """
 
@@ -20,9 +20,9 @@ from nfriction.plant.inertia import inertia_tensors
 Array = NDArray[np.float64]
 
 MOST_JOINTS, LONGEST_NAME = 50, 200
-# Of metres, kilograms and kg m^2: far beyond any mechanism, and squares of it can be added up.
+# In m, kg or kg m^2: far beyond any mechanism, and its squares can be summed.
 LARGEST_NUMBER = 1e9
-# A right angle written as 1.57 is off by less than this [rad]; a larger tilt is intended.
+# The error of a right angle written as 1.57 is smaller [rad]; a larger tilt is intended.
 TILT = 1e-3
 # Largest distance of a mass centre from the line through the joints, in lengths of the link.
 ASIDE = 1e-3
@@ -75,15 +75,15 @@ class _Planar:
 def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> PendulumChain:
     """The planar chain that these links form, given in any order, under a gravity (3,) [m/s^2].
 
-    Joint coordinates are those of the file: where the first link is nearer to upright than to
-    hanging at zero, its convention is measured from upright, else from hanging, and the rest goes
+    Joint coordinates are those of the file: if the first link at zero is nearer to upright than to
+    hanging, its angle is measured from upright, otherwise from hanging, and the difference goes
     into `angle_offset`. A first joint about the vertical becomes the arm. The length of the last
     link, which only drag needs, is that of a rod with its mass and inertia.
     """
     chain = _in_series(links)
     strength = float(np.linalg.norm(gravity))
     if not strength > 0:
-        raise ValueError("there is no gravity, and a pendulum needs some.")
+        raise ValueError("there is no gravity, but a pendulum needs gravity.")
     up = -gravity / strength
     arm = chain[0] if len(chain) > 1 and _tilt(chain[0].axis, up) < TILT else None
     hinged = chain[1:] if arm else chain
@@ -102,7 +102,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
     if arm:
         carrier, tensors = _carried(arm, hinged[0], mass, flat, tensors, up, z)
     with warnings.catch_warnings():
-        # An arm's tensors were checked before terms of other bodies were added to them.
+        # The tensors were checked before terms of other bodies were added to them.
         warnings.filterwarnings("ignore", message="the inertia of link")
         plant = PendulumChain(
             mass=mass,
@@ -116,7 +116,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
             joint_names=[link.name for link in chain],
             name=name,
         )
-    # Sines of pi leave 1e-16: a chain that hangs at zero has no offset.
+    # A sine of pi gives 1e-16, but a chain that hangs at zero has no offset.
     offset = [0.0] * bool(arm) + [0.0 if abs(o) < 1e-12 else o for o in offset]
     if any(offset):
         plant = plant.replace(angle_offset=torch.tensor(offset, dtype=torch.float64))
@@ -126,7 +126,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
 def _in_series(links: Sequence[HingedLink]) -> list[HingedLink]:
     """The links from the ground outward."""
     if not links:
-        raise ValueError("nothing in it turns; a chain needs at least one hinge.")
+        raise ValueError("it has no joint that turns; a chain needs at least one hinge.")
     if len(links) > MOST_JOINTS:
         raise ValueError(f"it has {len(links)} joints; chains of up to {MOST_JOINTS} are read.")
     chain: list[HingedLink] = []
@@ -146,8 +146,8 @@ def _in_series(links: Sequence[HingedLink]) -> list[HingedLink]:
 
 # What to do with other robots.
 IN_SPACE = (
-    'Of a robot in space, make the joints with other axes "fixed" and record with these at rest, '
-    "or fit the torques that its inverse dynamics do not explain by `nfriction fit-torque`"
+    'For a spatial robot, make the joints with other axes "fixed" and record with these at rest, '
+    "or fit the torques that its inverse dynamics do not explain with `nfriction fit-torque`"
 )
 
 
@@ -164,11 +164,11 @@ def _common_axis(links: Sequence[HingedLink], up: Array) -> Array:
         if apart > TILT:
             _refuse(link.name, f"has an axis {math.degrees(apart):.3g} degrees off that of "
                     f"{first.name!r}; all links must turn in one plane. {IN_SPACE}")  # fmt: skip
-        # Not turned round here: the sign of its recordings would silently change.
+        # Not reversed here, because the sign of its recordings would silently change.
         if link.axis @ first.axis < 0:
-            _refuse(link.name, f"turns against {first.name!r}: turn its axis round, and the sign "
-                    "of its recordings")  # fmt: skip
-    # A right angle written as 1.57 tilts the axis by less than anybody meant.
+            _refuse(link.name, f"turns against {first.name!r}: reverse its axis and the sign of "
+                    "its recordings")  # fmt: skip
+    # A right angle written as 1.57 tilts the axis unintentionally.
     level = first.axis - (first.axis @ up) * up
     return level / np.linalg.norm(level)
 
@@ -185,7 +185,7 @@ def _in_plane(
         reach = float(np.hypot(*ahead))
         if last:
             about_joint = float(z @ body.inertia @ z) + body.mass * reach**2
-            # An even rod of mass m and length L has m L^2 / 3 about its end.
+            # A uniform rod of mass m and length L has m L^2 / 3 about its end.
             size = math.sqrt(3 * about_joint / body.mass) or 1.0
             along = ahead / reach if reach > 1e-9 * size else np.array([-1.0, 0.0])
         else:
@@ -194,7 +194,7 @@ def _in_plane(
                         "need a length")  # fmt: skip
             size, along = reach, ahead / reach
             aside = along[0] * centre[1] - along[1] * centre[0]
-            # The equations know no mass beside the line through the joints.
+            # The equations have no mass off the line through the joints.
             if abs(aside) > ASIDE * size:
                 _refuse(link.name, f"carries a mass centre {1e3 * abs(aside):.4g} mm off the line "
                         f"to {links[k + 1].name!r}, {1e3 * size:.4g} mm away; it must lie on that "
@@ -219,8 +219,8 @@ def _carried(
 ) -> tuple[Arm, Array]:  # fmt: skip
     """The arm, and the links' tensors as it sees them.
 
-    A chain on an arm has all mass centres at one distance from the vertical axis. Where they lie
-    beside each other, the difference enters the equations as a product of inertia would.
+    A chain on an arm has all mass centres at one distance from the vertical axis. If the distances
+    differ, the differences enter the equations as products of inertia.
     """
     sign = 1.0 if arm.axis @ up > 0 else -1.0
     beside = float((first.anchor - arm.anchor) @ np.cross(z, up))
@@ -229,12 +229,12 @@ def _carried(
     length = float(m @ reach / m.sum())
     if not length > 0:
         _refuse(arm.name, f"turns so that {first.name!r} points inward ({1e3 * length:.4g} mm): "
-                "the axes must be such that the first points up and the others outward, or "
-                "down and inward; turn one round, and the sign of its recordings")  # fmt: skip
+                "the first axis must point up and the others outward, or down and inward; "
+                "reverse one and the sign of its recordings")  # fmt: skip
     if abs(beside) > ASIDE * length:
         _refuse(first.name, f"passes the axis of {arm.name!r} at {1e3 * abs(beside):.4g} mm; the "
                 "two axes must meet")  # fmt: skip
-    inertia_tensors(tensors.tolist(), len(m))  # warns where no body has such an inertia
+    inertia_tensors(tensors.tolist(), len(m))  # warns if no body can have such an inertia
     seen = tensors.copy()
     seen[:, 4:] *= sign
     moment = m * (reach - length)
@@ -252,7 +252,7 @@ def _carried(
 
 
 def _tilt(one: Array, other: Array) -> float:
-    """Angle between two axes, whichever way they point [rad], 0 to pi/2."""
+    """Angle between two axes regardless of their sense [rad], 0 to pi/2."""
     return math.atan2(float(np.linalg.norm(np.cross(one, other))), abs(float(one @ other)))
 
 

@@ -1,6 +1,6 @@
 """Rigs: published mechanisms by name, and a user's own from files.
 
-A rig file (JSON or TOML) holds the constructor arguments of `PendulumChain` (kind "chain", the
+A rig file (JSON or TOML) contains the constructor arguments of `PendulumChain` (kind "chain", the
 default), `Rotor` (kind "rotor") or `LinearAxis` (kind "axis"), in SI units:
 
     {"kind": "chain", "name": "bench", "mass": [0.26, 0.12], "length": [0.17, 0.23],
@@ -10,9 +10,9 @@ default), `Rotor` (kind "rotor") or `LinearAxis` (kind "axis"), in SI units:
      "motor": {"gear_ratio": 50, "rotor_inertia": 1.2e-5, "torque_constant": 0.03}}
 
 Angles of a chain without a `convention` are relative, from upright. `motor` may be given for every
-kind, with one number for all joints or one for each (`Motor`). `buffers` may hold values in place
-of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so.
-Robot descriptions (URDF, MJCF) are read, too.
+kind, with one number for all joints or one for each (`Motor`). `buffers` may contain values in
+place of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`, as in the file of a fitted
+plant. Robot descriptions (URDF, MJCF) can also be read.
 """
 
 import difflib
@@ -47,16 +47,16 @@ def tlrip(
     name: str = "tlrip",
     convention: Sequence[str] = ("relative", "upright"),
 ) -> PendulumChain:
-    """Triple link rotary inverted pendulum (Table 2); paper joints 2, 3, 4, with a free arm 1 too.
+    """Triple link rotary inverted pendulum (Table 2): paper joints 2 to 4, with a free arm 1 to 4.
 
-    Mass centres half way. The printed Izz are taken about the mass centres. The arm is a rod with
-    Izz1 about its own centre; its balance mass appears in no printed equation and is left out.
+    Mass centres are in the middle of links; the printed Izz are taken about them. The arm is a rod
+    with Izz1 about its own centre; its balance mass is left out, as in all printed equations.
 
     Args:
         arm: "fixed" (three joints) or "free" (four, the arm first).
         inertia: "none" (point masses), "izz" (slender links with the printed Izz) or a full
             tensor per link, (3, 6) as in `PendulumChain` [kg m^2].
-        name, convention: for a rig of the same numbers.
+        name, convention: for another rig with the same numbers.
 
     References:
         Comparative study of joint neuro-fuzzy friction models for a triple link rotary inverted
@@ -87,8 +87,9 @@ def tlrip(
 def rtip(arm: Literal["fixed", "free"] = "fixed", inertia: InertiaCase = "izz") -> PendulumChain:
     """Rotary triple inverted pendulum of the second paper.
 
-    Assumed: that paper prints no masses or lengths and describes the same pendulum, so the numbers
-    are Table 2 of the first. Known to differ: angles are measured from hanging.
+    That paper prints no masses or lengths and describes the same pendulum, so the numbers are
+    assumed to be those in Table 2 of the first paper. In contrast, angles are measured from
+    hanging.
 
     References:
         Comparison of friction estimation models for a rotary triple inverted pendulum.
@@ -102,9 +103,9 @@ def _multiarm(
 ) -> PendulumChain:  # fmt: skip
     """A pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231).
 
-    The last link's length is published for none of them; it is taken as twice the distance to its
-    mass centre, as for an even rod, and matters to air drag only. The authors' values were fitted
-    with viscous friction; in free swing only ratios are identifiable.
+    The last link's length is not published for any of them; it is taken as twice the distance to
+    its mass centre, as for a uniform rod, and affects only air drag. The authors' values were
+    fitted with viscous friction; in free swing only ratios are identifiable.
     """
     return PendulumChain(
         mass=mass,
@@ -155,11 +156,11 @@ _DFKI_GEAR = 6
 def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
     """Driven double pendulum of DFKI with quasi-direct drives, in three builds.
 
-    The source adds the rotors as Ir (gr^2 + 1), -gr Ir, gr^2 Ir to M11, M12, M22: motor 2 turns
-    against its joint, carried by link 1. That is, exactly, an inertia of link 2 smaller by gr Ir
-    and armatures of (gr^2 + gr + 1) Ir and (gr^2 + gr) Ir, and is built so. In build C0 link 2's
-    published inertia about its joint is below m r^2, which no body has; the mass matrix is
-    positive definite all the same.
+    The source adds the rotors as Ir (gr^2 + 1), -gr Ir, gr^2 Ir to M11, M12, M22: motor 2, carried
+    by link 1, turns against its joint. This is exactly equivalent to an inertia of link 2 that is
+    smaller by gr Ir, and armatures of (gr^2 + gr + 1) Ir and (gr^2 + gr) Ir, which are used here.
+    In build C0 link 2's published inertia about its joint is below m r^2, which is impossible for a
+    body; the mass matrix is nevertheless positive definite.
 
     References:
         github.com/dfki-ric-underactuated-lab/double_pendulum.
@@ -171,7 +172,7 @@ def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
     inertia = [i - m * r**2 for i, m, r in zip(p["I"], p["m"], p["r"], strict=True)]
     inertia[1] -= gear * p["Ir"]
     with warnings.catch_warnings():
-        # Build C0: stated above, and its user cannot change it.
+        # Build C0: documented above, and a user cannot change it.
         warnings.filterwarnings("ignore", message="the inertia of link")
         return PendulumChain(
             mass=p["m"],
@@ -188,9 +189,9 @@ def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
 def emps() -> LinearAxis:
     """Electro-mechanical positioning system, a ball-screw axis (Janot, Gautier, Brunot 2019).
 
-    Published: tau = 95.1089 qdd + Fv qd + Fc sgn(qd) - 3.1648; the offset is on the friction's
-    side, so it adds to tau here with the other sign. A regression on the recording confirms it
-    (+3.10 N, 98.8 kg).
+    Published: tau = 95.1089 qdd + Fv qd + Fc sgn(qd) - 3.1648; the offset is on the side of the
+    friction, so it is added to tau here with opposite sign. A regression on the recording confirms
+    it (+3.10 N, 98.8 kg).
     """
     return LinearAxis(
         95.1089, torque_offset=3.1648, name="emps", joint_names=["axis"], position_quantum=5e-8
@@ -200,8 +201,8 @@ def emps() -> LinearAxis:
 def xl330() -> PendulumChain:
     """Pendulum on a Dynamixel XL330 servo (Duclusaud et al., ICRA 2025).
 
-    0.49 kg at 0.10 m as published in each log. The rotor's inertia is not: 2.1e-3 kg m^2 brings
-    the total to the 7.0e-3 that fits the drops.
+    0.49 kg at 0.10 m as published in each log. The rotor's inertia is not published: 2.1e-3 kg m^2
+    brings the total to the 7.0e-3 that fits the drops.
     """
     return PendulumChain(
         mass=[0.49],
@@ -237,7 +238,7 @@ def by_name(name: str) -> Plant:
     """A rig by its name.
 
     Raises:
-        ValueError: for a name that is none of `names()`.
+        ValueError: for a name that is not in `names()`.
     """
     if name not in _RIGS:
         near = difflib.get_close_matches(str(name), _RIGS, 1)
@@ -257,7 +258,7 @@ _TEXTS = ("kind", "name", "convention", "joint_names", "normal_load")
 
 
 def of(rig: Plant | str | Path) -> Plant:
-    """A plant as it is, or the one that a name or a rig file gives.
+    """The given plant, or the one of a name or rig file.
 
     Raises:
         TypeError: for anything else.
@@ -274,7 +275,7 @@ def of(rig: Plant | str | Path) -> Plant:
 
 
 def from_dict(data: Mapping[str, Any]) -> Plant:
-    """The plant of a `to_dict`, whichever its kind.
+    """The plant of a `to_dict`, of any kind.
 
     Raises:
         ValueError: for an unknown kind, missing or unknown keys, or impossible values.
@@ -294,13 +295,13 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
 
 
 def read(path: str | Path) -> Plant:
-    """Read a rig file: .json, .toml from Python 3.11 on, .urdf, or .xml (MJCF or URDF).
+    """Read a rig file: .json, .toml (Python 3.11 or newer), .urdf, or .xml (MJCF or URDF).
 
     Raises:
         ValueError: for another ending, a file that does not parse, or parameters that
             `from_dict` refuses; the message names the file.
-        OSError: where the file cannot be read.
-        ImportError: for an MJCF where MuJoCo is not installed.
+        OSError: if the file cannot be read.
+        ImportError: for an MJCF file if MuJoCo is not installed.
     """
     path = Path(path)
     try:
@@ -317,7 +318,7 @@ def read(path: str | Path) -> Plant:
 
 
 def write(plant: Plant, path: str | Path) -> None:
-    """Write a plant, fitted buffers included, as JSON that `read` takes; whole or not at all.
+    """Write a plant, including fitted buffers, atomically as JSON for `read`.
 
     Raises:
         ValueError: for an ending other than .json.
@@ -330,7 +331,7 @@ def write(plant: Plant, path: str | Path) -> None:
 
 
 def _check_numbers(key: str, value: Any) -> None:
-    """Refuse numbers that torch would take and no rig has: booleans, and lists without end."""
+    """Refuse values that torch would accept but no rig has: booleans, and very long lists."""
     if isinstance(value, Mapping):
         for name, entry in value.items():
             _check_numbers(f"{key}.{name}", entry)
@@ -342,7 +343,7 @@ def _check_numbers(key: str, value: Any) -> None:
 
 
 def _are_numbers(value: Any, depth: int = 0) -> bool:
-    """True for a finite number, or a list or matrix of such."""
+    """True for a finite number, or a list or matrix of them."""
     if isinstance(value, (list, tuple)):
         alike = len({isinstance(v, (list, tuple)) for v in value}) < 2
         small = len(value) <= MOST_LINKS and depth < 2

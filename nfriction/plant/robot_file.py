@@ -1,4 +1,4 @@
-"""Mechanisms from robot descriptions: URDF, by the standard library, or MuJoCo's MJCF."""
+"""Mechanisms from robot descriptions: URDF, read with the standard library, or MuJoCo's MJCF."""
 
 import warnings
 from pathlib import Path
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 ENDINGS = (".urdf", ".xml", ".mjcf")
 LARGEST_FILE = 64 * 2**20
-GRAVITY = np.array([0.0, 0.0, -9.81])  # of URDF, which gives none but has z up (REP 103) [m/s^2]
+GRAVITY = np.array([0.0, 0.0, -9.81])  # URDF states none, but its z is up (REP 103) [m/s^2]
 
 _HINGES = ("revolute", "continuous")
 # Elements that generate many bodies, or read other files as descriptions.
@@ -30,7 +30,7 @@ _NO_CHAIN = ("replicate", "composite", "flexcomp", "attach", "plugin", "extensio
 
 
 def read_robot(path: str | Path) -> PendulumChain:
-    """The chain of a URDF or MJCF, with joint names and coordinates as the file has them.
+    """The chain of a URDF or MJCF, with the file's joint names and coordinates.
 
     Serial chains of hinges with parallel, horizontal axes are read, alone or on an arm that turns
     about the vertical. Bodies fixed to a link count as part of it. Rotor inertias are MJCF's
@@ -38,9 +38,9 @@ def read_robot(path: str | Path) -> PendulumChain:
     """
     path = Path(path)
     root = parse_xml(path)
-    # Macros are a program; running one is not for a reader of data.
+    # Macros are a program, which a reader of data must not run.
     if any("xacro" in element.tag for element in root.iter()):
-        raise ValueError("holds macros; write it out first: xacro robot.xacro > robot.urdf")
+        raise ValueError("contains macros; expand it first: xacro robot.xacro > robot.urdf")
     if root.tag == "robot":
         return pendulum_chain(urdf_links(root), GRAVITY, root.get("name", ""))
     if root.tag == "mujoco":
@@ -49,7 +49,7 @@ def read_robot(path: str | Path) -> PendulumChain:
 
 
 def parse_xml(path: Path, *, comments: bool = False) -> Element:
-    """The root of an XML file, with its `comments` as elements if asked for."""
+    """The root of an XML file, with its comments as elements if `comments`."""
     size = path.stat().st_size
     if size > LARGEST_FILE:
         raise ValueError(f"{size} bytes are too large for a robot description.")
@@ -64,7 +64,7 @@ def parse_xml(path: Path, *, comments: bool = False) -> Element:
     try:
         return ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
-        raise ValueError(f"no XML, or cut short ({error}).") from error
+        raise ValueError(f"not XML, or cut short ({error}).") from error
 
 
 def urdf_links(robot: Element) -> list[HingedLink]:
@@ -78,7 +78,7 @@ def urdf_links(robot: Element) -> list[HingedLink]:
             raise ValueError(f"link {child!r} is the child of two joints; a chain has no loop.")
         carried.add(child)
         children[parent].append(joint)
-    # A tree has one root; more are several robots in one file.
+    # A tree has one root; with more there are several robots in one file.
     roots = [name for name in links if name not in carried]
     if len(roots) != 1:
         raise ValueError(f"there must be one link that no joint carries, got {roots}.")
@@ -101,7 +101,7 @@ def urdf_links(robot: Element) -> list[HingedLink]:
             waiting.append((_link(joint, "child", "", links), frame, origin, of))
     # Links in a loop are carried by each other, and never reached from the root.
     if reached < len(links):
-        raise ValueError(f"{len(links) - reached} links go round in a circle, off the ground.")
+        raise ValueError(f"{len(links) - reached} links form a loop without connection to ground.")
     return found
 
 
@@ -112,14 +112,14 @@ def _hinge(joint: Element, frame: Array, origin: Array, parent: int | None) -> H
             f"joint {name!r} is {joint.get('type', '')[:80]!r}; a pendulum's are revolute or "
             "continuous."
         )
-    # A coupled joint is one degree of freedom less than the chain has.
+    # A coupled joint removes a degree of freedom of the chain.
     if joint.find("mimic") is not None:
         raise ValueError(f"joint {name!r} mimics another; every joint must be free.")
     given = joint.find("axis")
     axis = _numbers(given, "xyz", f"axis of joint {name!r}", "1 0 0")
     size = float(np.linalg.norm(axis))
     if not size > 0:
-        raise ValueError(f"joint {name!r} has an axis of no direction.")
+        raise ValueError(f"joint {name!r} has an axis without direction.")
     return HingedLink(name, parent, frame @ axis / size, origin)
 
 
@@ -127,7 +127,7 @@ def _body(inertial: Element, link: str, turn: Array, place: Array) -> RigidBody:
     what = f"link {link!r}"
     rotation, com = _origin(inertial, f"inertial of {what}")
     given, mass = inertial.find("inertia"), inertial.find("mass")
-    # URDF allows their absence, and simulators then differ in their defaults.
+    # URDF allows them to be absent, but then simulators use different defaults.
     if given is None or mass is None:
         raise ValueError(f"{what}: an inertial needs `mass` and `inertia`.")
     xx, yy, zz, xy, xz, yz = (
@@ -148,7 +148,7 @@ def _origin(element: Element, what: str) -> tuple[Array, Array]:
 
     given = element.find("origin")
     what = f"origin of the {what}"
-    # Roll, pitch and yaw are about the axes that stay, which lower-case letters mean.
+    # Roll, pitch and yaw are about fixed axes, which lower-case letters denote.
     turn = Rotation.from_euler("xyz", _numbers(given, "rpy", what, "0 0 0"))
     return turn.as_matrix(), _numbers(given, "xyz", what, "0 0 0")
 
@@ -177,9 +177,7 @@ def _named(robot: Element, tag: str) -> dict[str, Element]:
         if len(name) > LONGEST_NAME:
             raise ValueError(f"{tag} {name[:80]!r}... has a name of {len(name)} characters.")
         if not name or name in found:
-            raise ValueError(
-                f"every {tag} needs a name of its own, got {name[:80]!r} again or empty."
-            )
+            raise ValueError(f"every {tag} needs a unique name, got {name[:80]!r} again or empty.")
         found[name] = element
     return found
 
@@ -188,14 +186,14 @@ def _link(joint: Element, end: str, name: str, links: dict[str, Element]) -> str
     given = joint.find(end)
     link = "" if given is None else given.get("link", "")
     if link not in links:
-        raise ValueError(f"joint {name!r} has a {end} that is no link: {link[:80]!r}.")
+        raise ValueError(f"joint {name!r} has a {end} that is not a link: {link[:80]!r}.")
     return link
 
 
 def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], Array, str]:
     """The hinged links of an MJCF at its reference pose, its gravity [m/s^2], and its name.
 
-    Read by MuJoCo's own compiler, which knows default classes, geoms and meshes.
+    Read with MuJoCo's own compiler, which resolves default classes, geoms and meshes.
     """
     for element in root.iter():
         name = element.get("name", "")
@@ -207,7 +205,7 @@ def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], Array, str]
         import mujoco
     except ImportError as error:
         raise ImportError(
-            "reading an MJCF takes MuJoCo, whose compiler knows its default classes and "
+            "reading an MJCF file needs MuJoCo, whose compiler resolves default classes and "
             "geometries: pip install mujoco; or give a URDF or a rig file."
         ) from error
     model, data = _at_reference(path, mujoco)
@@ -237,12 +235,12 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
     """The compiled model, and its data at the reference pose."""
     said: list[str] = []
     handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)  # else MuJoCo writes a log file to the current folder
+    mujoco.set_mju_user_warning(said.append)  # otherwise MuJoCo writes a log file to the folder
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
         _refuse_more_than_hinges(model, mujoco)
         data = mujoco.MjData(model)
-        # Where MuJoCo's own coordinates are `ref`, as the file draws the bodies.
+        # The pose in which the file describes the bodies: MuJoCo's coordinates equal `ref`.
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
     finally:
@@ -258,7 +256,7 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
 
 
 def _refuse_more_than_hinges(model: Any, mujoco: Any) -> None:
-    """Refuse forces on a chain that are no part of the equations of motion."""
+    """Refuse forces on a chain that are not part of the equations of motion."""
     for joint in range(model.njnt):
         name = model.joint(joint).name
         kind = mujoco.mjtJoint(model.jnt_type[joint])
@@ -274,10 +272,10 @@ def _refuse_more_than_hinges(model: Any, mujoco: Any) -> None:
         # Air drag is fitted together with the friction.
         (
             model.opt.density or model.opt.viscosity,
-            "its medium brakes; set density, viscosity to 0",
+            "its medium causes drag; set density and viscosity to 0",
         ),
         (model.body_gravcomp.any(), "it compensates gravity (gravcomp); leave that to the torques"),
-        (no_gravity, "its gravity is switched off, and a pendulum needs some"),
+        (no_gravity, "its gravity is switched off, but a pendulum needs gravity"),
     ):
         if found:
             raise ValueError(f"{why}.")

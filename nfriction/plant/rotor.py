@@ -13,15 +13,15 @@ from nfriction.plant.chain import PendulumChain
 class Rotor(PendulumChain):
     """Equation of motion (inertia + rotor) qdd - mass g com sin q = tau + torque_offset.
 
-    In rad and N m at the joint, behind the gear if there is one; q is measured from upright. A
-    chain of one link, but described as a motor's load is, and with all inertia in one number.
+    In rad and N m at the joint, after the gear if there is one; q is measured from upright. It is a
+    chain of one link, but described like the load of a motor, with all inertia in one number.
 
     Args:
         inertia: of everything on the shaft about the axis, without the motor's rotor [kg m^2].
-        mass: of a pendulum or an unbalanced load [kg]; zero where all is balanced.
-        com: from the axis to that mass' centre [m].
+        mass: of a pendulum or an unbalanced load [kg]; zero if balanced.
+        com: distance from the axis to the centre of that mass [m].
         motor: its rotor's inertia is added, times the gear ratio squared.
-        convention: `("relative", "hanging")` where zero is the rest pose of a pendulum.
+        convention: `("relative", "hanging")` if zero is the rest pose of a pendulum.
         name, joint_names, position_quantum: see `Plant`.
 
     Raises:
@@ -53,9 +53,9 @@ class Rotor(PendulumChain):
         if bool(mass) != bool(com):
             raise ValueError(
                 f"`mass` and `com` belong together, got {mass} and {com}: a pendulum needs both; "
-                "leave both out of a balanced wheel."
+                "omit both for a balanced wheel."
             )
-        # Rounding: a point mass on a rod without one has just this inertia.
+        # Up to round-off: a point mass on a massless rod has exactly this inertia.
         if inertia < (1 - 1e-9) * mass * com**2:
             raise ValueError(
                 f"`inertia` is about the axis and at least mass com^2 = {mass * com**2:.4g} "
@@ -63,7 +63,7 @@ class Rotor(PendulumChain):
             )
         if not isinstance(motor, Motor | None):
             raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
-        # All inertia in one number, for none of its parts is identifiable beside the others.
+        # All inertia in one number, because its parts are not identifiable separately.
         rotor = 0.0 if motor is None else float(motor.reflected_inertia(1))
         if not inertia + rotor > 0:
             raise ValueError(
@@ -80,7 +80,7 @@ class Rotor(PendulumChain):
         self._given = {**given, "convention": list(self.convention)}
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """1 [-]: the load of the gear and bearings of a motor hardly depends on the pose."""
+        """1 [-], because the load of a motor's gear and bearings hardly depends on the pose."""
         self._check(q=q, qd=qd)
         return torch.ones_like(q)
 

@@ -32,7 +32,7 @@ from nfriction.recording import Recording
 
 Array = NDArray[np.float64]
 
-# Room that a bar and its number need side by side with others [in].
+# Width that a bar and its number need next to others [in].
 _BAR = 0.13
 
 
@@ -42,12 +42,12 @@ def motion(
     *,
     joints: Sequence[int] | None = None,
 ) -> Figure:
-    """Measured positions over time, a panel a joint, under simulated ones.
+    """Measured positions over time, one panel per joint, under simulated ones.
 
     Args:
         recording: the measured motion, in its own convention and unit.
-        scores: scores on this very recording by name, whose simulated positions are drawn.
-        joints: places of the joints to draw; all by default.
+        scores: scores on the same recording by name, whose simulated positions are drawn.
+        joints: indices of the joints to draw; all by default.
 
     Raises:
         ValueError: if a score belongs to another recording.
@@ -62,7 +62,7 @@ def motion(
         ax.plot(recording.time, measured, **style.MEASURED)
         for name, score in scores.items():
             ax.plot(recording.time, score.simulated[:, joint], **looks[name].line)
-        # Simulations that leave the measured range would flatten it.
+        # Otherwise simulations that leave the measured range would flatten it.
         ax.set_ylim(style.padded(float(measured.min()), float(measured.max()), 0.25))
         ax.set_ylabel(f"{recording.names[joint]} [{recording.unit}]")
         ax.margins(x=0.01)
@@ -74,15 +74,15 @@ def motion(
 
 
 def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
-    """Measured against simulated position, a pair of panels a joint: position, error below.
+    """Measured and simulated position, two panels per joint: position, and the error below.
 
-    A panel spans the measured range, and the errors of models that did not diverge, up to half of
-    that. The error without friction, which would leave it at every swing, is drawn only where
+    Panels span the measured range, and the errors of models that did not diverge, up to half of
+    that range. The error without friction, which would exceed it at every swing, is drawn only if
     there is no other model.
 
     Args:
         recording: the measured motion, in its own convention and unit.
-        scores: scores on this very recording by model name, simulated positions included.
+        scores: scores on the same recording by model name, including simulated positions.
 
     Raises:
         ValueError: if there are no scores, or one belongs to another recording.
@@ -127,10 +127,10 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
 
 
 def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
-    """Bars of the position error by joint and model; those that diverged reach the top.
+    """Bars of the position error by joint and model; those of diverged simulations reach the top.
 
     Args:
-        table: a row a model, a column a joint, as `Comparison.table` gives it; infinite where a
+        table: one row per model, one column per joint, as from `Comparison.table`; infinite if a
             simulation diverged.
         unit: of its values, `"rad"` or `"m"`.
 
@@ -139,7 +139,7 @@ def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
     """
     values = table.to_numpy(dtype=np.float64)
     if values.size == 0:
-        raise ValueError("`table` is empty; it needs a row a model and a column a joint.")
+        raise ValueError("`table` is empty; it needs one row per model and one column per joint.")
     values = 1e3 * values  # as in every table
     models, joints = [str(name) for name in table.index], [str(name) for name in table.columns]
     # Numbers above bars must not overlap.
@@ -150,7 +150,7 @@ def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
     finite = values[np.isfinite(values) & (values > 0)]
     largest, smallest = (finite.max(), finite.min()) if finite.size else (1.0, 1.0)
     if style.spread(values) > style.LOG_FROM:
-        # A number above a bar takes a share of the axis, not of the value.
+        # A number above a bar takes up a share of the axis, not of the value.
         bottom, top = smallest / 2.5, largest * (largest / smallest) ** 0.3
         style.log_axis(ax, bottom, top)
     else:
@@ -178,12 +178,12 @@ def horizon_curve(
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 
-    The band is the limit of these data, the effect of the start's uncertainty on the best model:
-    differences between models below it are not meaningful.
+    The band is the limit of these data, the effect of noise and integration on the best model:
+    smaller differences between models are not meaningful.
 
     Args:
         comparison: fits and scores.
-        part: `"test"` or `"train"`; default test recordings where there are any.
+        part: `"test"` or `"train"`; by default test recordings if there are any.
         column: joint of the tables, or `"all"`.
     """
     part = part or comparison.parts[0]
@@ -228,20 +228,20 @@ def horizon_curve(
 
 
 def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
-    """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
+    """Fitted coefficients with 95 % intervals, one panel per coefficient; joints side by side.
 
-    Intervals of unidentifiable coefficients reach from edge to edge of a panel.
+    Intervals of unidentifiable coefficients span the whole panel.
 
     Args:
-        fits: of models with constant coefficients of one law, by name: of other recordings, say.
+        fits: of models of one law with constant coefficients, by name, such as of its recording.
 
     Raises:
-        ValueError: if there is no such fit, or one is of another law.
+        ValueError: if there is no fit, or their laws differ.
     """
     laws = {found.model.law.name for found in fits.values()}
     if len(laws) != 1 or any(found.model.schedule.follows_motion for found in fits.values()):
         raise ValueError(
-            f"`fits` must be of constant coefficients of one law, got laws {sorted(laws)}."
+            f"`fits` must have constant coefficients of one law, got laws {sorted(laws)}."
         )
     first = next(iter(fits.values()))
     joints, law = first.plant.joint_names, first.model.law
@@ -277,7 +277,7 @@ def _check_same_recording(recording: Recording, scores: Mapping[str, Score]) -> 
         if score.simulated.shape != recording.q.shape:
             raise ValueError(
                 f"the score of {name!r} has simulated positions {score.simulated.shape}, the "
-                f"recording {recording.q.shape}; scores must be of this very recording."
+                f"recording {recording.q.shape}; scores must be of the same recording."
             )
 
 
@@ -291,7 +291,7 @@ def _label(name: str, score: Score) -> str:
 
 
 def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> None:
-    """The value above a bar, upright; in words where there is none."""
+    """The value above a bar, upright; a word if it is infinite."""
     inside = np.isinf(value)
     digits = f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
     text = "diverged" if inside else "n/a" if np.isnan(value) else digits
@@ -314,7 +314,7 @@ def _intervals(found: FitResult, name: str, k: int) -> Array:
 
 DPI = 150
 RUN_KEY = "nfriction run"
-"""Of the text in a PNG file that names its run."""
+"""Key of the text in a PNG file that names its run."""
 
 
 def save_all(
@@ -328,23 +328,23 @@ def save_all(
     """Write every figure of a comparison as PNG.
 
     `mechanism`, `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
-    recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
-    motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`. A
-    network that was rejected has constant coefficients and none of these.
+    given recording, `torque_over_velocity`, `over_time_*` for each law with a model that follows
+    the motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`. A
+    rejected network has constant coefficients and none of these.
 
     Args:
         comparison: fits and scores.
         recordings: those compared, or some of them.
-        folder: made where it does not exist; files of the same name are replaced.
-        run: id of the run, kept in each PNG file.
-        formats: further ones: `"svg"` or `"pdf"` for papers, `"gif"` for animations of the test
+        folder: made if it does not exist; files of the same name are replaced.
+        run: id of the run, written into each PNG file.
+        formats: additional ones: `"svg"` or `"pdf"` for papers, `"gif"` for animations of the test
             recordings, `motion_1.gif` and so on.
 
     Returns:
         The files written.
 
     Raises:
-        ValueError: if a recording is not among those compared.
+        ValueError: if a recording was not compared.
     """
     scored = {
         s.recording for p in comparison.parts for s in next(iter(comparison.scores(p).values()))
@@ -375,7 +375,7 @@ def save_all(
 
 
 def _free(folder: Path, name: str, taken: Sequence[Path]) -> Path:
-    """A path that is not taken: names of recordings may differ only in characters replaced here."""
+    """An unused path: names of recordings may differ only in characters that are replaced here."""
     stem = re.sub(r"[^\w-]+", "_", name)
     ends = ("", *(f"_{k}" for k in range(2, 3 + len(taken))))
     return next(path for end in ends if (path := folder / f"{stem}{end}.png") not in taken)
@@ -396,7 +396,7 @@ def _figures(
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}
             if of:
                 yield f"positions_{part}_{recording.name}", positions(recording, of)
-    # A comparison that was read from a file has scores only.
+    # A comparison read from a file has only scores.
     if not comparison.fits:
         return
     last = list(comparison.fits.values())[-1]
@@ -421,7 +421,7 @@ def _figures(
         yield "torque_over_velocity", figure
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
     for law in dict.fromkeys(model.law.name for model in models.values()):
-        # Constants along the motion are worth a figure beside coefficients that follow it.
+        # Constants along the motion are worth drawing only with coefficients that follow it.
         sets = [m.schedule.coefficient_sets() for m in models.values() if m.law.name == law]
         if any("always" not in of_model for of_model in sets):
             figure = coefficients_over_time(models, last.motions[0], law=law, **labels)

@@ -32,7 +32,7 @@ class _View(NamedTuple):
 
 
 def mechanism(plant: Plant) -> Figure:
-    """The mechanism in a pose near rest: links, joints and mass centres, and the data of each.
+    """The mechanism in a pose near rest: links, joints, centres of mass, and their data.
 
     Args:
         plant: as given, or as fitted.
@@ -73,15 +73,15 @@ def animate(
     *,
     seconds: float = 10.0,
 ) -> Path:
-    """Write motions of a mechanism over each other as a GIF, in real time.
+    """Write overlaid motions of a mechanism as a GIF, in real time.
 
     Args:
         plant: the mechanism.
         time: [s], (time,).
         motions: positions in joint coordinates by name, (time, joint); "measured" is drawn broad
-            and grey. A motion vanishes where it is not finite.
+            and grey. A motion is hidden while it is not finite.
         path: of the file.
-        seconds: drawn at most.
+        seconds: longest duration drawn.
     """
     from matplotlib.animation import FuncAnimation, PillowWriter  # slow to import
 
@@ -129,11 +129,11 @@ def _views(plant: Plant) -> list[_View]:
     if isinstance(plant, LinearAxis):
         return [_View("", 1.0, lambda q: np.array([[q[0], 0.0]]))]
     if not isinstance(plant, PendulumChain):
-        raise ValueError(f"no drawing is known of a {type(plant).__name__}.")
+        raise ValueError(f"a {type(plant).__name__} cannot be drawn.")
     lengths, first = plant.length.detach().numpy(), plant.first_link
 
     def links(q: Array) -> Array:
-        # Positive angles tilt a link against an arm's sense of turning.
+        # Positive angles tilt a link against the direction in which an arm turns.
         angles = np.cumsum(q[first:])
         ends = np.cumsum(lengths[:, None] * np.stack([-np.sin(angles), np.cos(angles)], -1), 0)
         return np.concatenate([np.zeros((1, 2)), ends])
@@ -148,7 +148,7 @@ def _views(plant: Plant) -> list[_View]:
 
 
 def _centres(plant: PendulumChain) -> Array:
-    """Mass centres as shares of the links' lengths; none of a balanced rotor."""
+    """Mass centres as shares of the links' lengths; none for a balanced rotor."""
     if isinstance(plant, Rotor):
         return np.array([0.5] * bool(plant.to_dict()["mass"]))
     return np.divide(plant.to_dict()["com"], plant.length.detach().numpy())
@@ -164,7 +164,7 @@ def _frame(ax: Axes, view: _View, plant: Plant) -> None:
         ax.axhline(0, color=style.FAINT, linewidth=1.0)
         ax.set_yticks([])
     elif isinstance(plant, Rotor) and not plant.to_dict()["mass"]:
-        ax.set(xticks=[], yticks=[], xlabel="")  # of a flywheel no size is known
+        ax.set(xticks=[], yticks=[], xlabel="")  # the size of a flywheel is unknown
         ax.set_axis_off()
         ax.add_patch(Circle((0, 0), view.reach, facecolor=style.UNSEEN, edgecolor=style.FAINT))
 
@@ -174,7 +174,7 @@ def _line(colour: str) -> dict[str, object]:
 
 
 def _data(plant: Plant) -> list[str]:
-    """The plant's numbers in words, a line each."""
+    """The plant's parameters in words, one line each."""
     given = plant.to_dict()
     lines = [plant.name or f"{given['kind']} without a name", ""]
     if isinstance(plant, PendulumChain) and not isinstance(plant, Rotor):

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_POINTS = 3000  # that are drawn, a joint
-_BINS = 24  # of medians
+_POINTS = 3000  # drawn per joint
+_BINS = 24  # of velocity, for medians
 _DOT = Line2D([], [], linestyle="", marker=".", color=style.FAINT)
 _MEDIAN = Line2D([], [], linestyle="", marker="o", color=style.INK, markersize=2.2)
 _BAND = Patch(facecolor=style.FAINT, alpha=0.4)
@@ -48,17 +48,17 @@ def torque_over_velocity(
     *,
     uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
 ) -> Figure:
-    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
+    """Friction torque of each law over velocity, one panel per joint, over that of the motion.
 
     Lines are at the load at rest and without acceleration, with 95 % bands; dots are
-    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
-    Medians of bins of velocity, with their quartiles, show the friction where dots scatter far.
+    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint does not
+    reverse. Medians and quartiles in velocity bins show the friction where dots scatter widely.
 
     Args:
-        plant: the mechanism, with its fitted terms where there are any.
+        plant: the mechanism, with its fitted terms if there are any.
         models: friction models by name.
         recordings: in any convention.
-        motions: their smoothed motion in joint coordinates; computed where not given.
+        motions: their smoothed motion in joint coordinates; computed if not given.
         uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
     """
     joint = [r.joint_coordinates(plant) for r in recordings]
@@ -77,7 +77,7 @@ def torque_over_velocity(
         lines = {name: _torque(model, grid, k) for name, model in models.items()}
         seen = np.flatnonzero(np.isfinite(torque[:, k]))
         binned = _binned(qd[seen, k], torque[seen, k])
-        # Dots may scatter far beyond any friction; the laws and the quartiles set the limits.
+        # Dots may scatter far beyond the friction, so laws and quartiles set the limits.
         extremes = np.concatenate([*lines.values(), *binned[1:]])
         factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
         _dots(ax, qd[seen, k], factor * torque[seen, k])
@@ -102,17 +102,17 @@ def torque_over_velocity(
 
 
 def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
-    """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
+    """Means over blocks of samples, NaN if a joint reverses within a block."""
     size = max(1, min(round(DEFAULTS.diagnosis_block / step), len(qd)))
     whole = len(qd) // size * size
     speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
     one_way = torch.sign(speeds).mean(1).abs() == 1
-    # Dry friction takes any value at rest.
+    # Dry friction can have any value at rest.
     return speeds.mean(1).numpy(), torch.where(one_way, torques.mean(1), torch.nan).numpy()
 
 
 def _panels(joints: int) -> tuple[Figure, list[Axes], int]:
-    """A panel a joint, and how many are side by side."""
+    """One panel per joint, and the number of columns."""
     columns = min(joints, 3) if joints != 4 else 2
     width = style.PAGE if columns > 1 else style.COLUMN
     return *style.panel_each(joints, columns, width, 2.0), columns
@@ -139,7 +139,7 @@ def _name_axes(ax: Axes, title: str, position: str, unit: str) -> None:
 
 
 def velocities(qd: Array) -> Array:
-    """The range of the data, dense about zero, where laws turn over a few thousandths."""
+    """The range of the data, dense near zero, where laws change over a few thousandths."""
     low, high = float(qd.min()), float(qd.max())
     # Evenly spaced velocities would draw the step at zero as a slope.
     near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
@@ -157,13 +157,12 @@ def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
 
 
 def friction_curves(fits: "TorqueFits") -> Figure:
-    """Friction torque of the rows and of the laws, a panel a joint.
+    """Friction torque of the rows and of the laws, one panel per joint.
 
-    Over velocity, with medians of bins, where the law chosen has no memory: it is drawn thick at
-    the median load and without acceleration, with the 95 % band that the uncertainty of its
-    coefficients leaves; bars are the quartiles of each bin of velocity. Over position, row by row,
-    where it has memory, as no curve over velocity shows a loop. Beside it is the best law of the
-    other kind.
+    If the chosen law has no memory, it is drawn over velocity, thick, at the median load and
+    without acceleration, with the 95 % band due to the uncertainty of its coefficients, over
+    medians and quartiles in velocity bins. If it has memory, it is drawn over position, row by row,
+    because a curve over velocity cannot show a loop. The best law of the other kind is also drawn.
     """
     joints = fits.table.joints
     figure, axes, _ = _panels(len(joints))
@@ -208,7 +207,7 @@ def _loops(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str
         path, factor * joint.tau, ".", color=style.FAINT, markersize=1.5, alpha=0.5,
         markeredgewidth=0, rasterized=True,
     )  # fmt: skip
-    # The one chosen on top.
+    # The chosen one on top.
     for name, look in reversed(lines):
         first = name == lines[0][0]
         ax.plot(path, factor * torques[name], **look | {"linewidth": 0.9 if first else 0.5},
@@ -245,9 +244,9 @@ def _steady(found: "JointFit", joint: "JointTorque", qd: Array) -> tuple[Array, 
 
 
 def _binned(qd: Array, tau: Array) -> Array:
-    """Median velocity, quartile, median and quartile of the torque, in bins of about as many rows.
+    """Median velocity, quartile, median and quartile of the torque, in bins of about equal size.
 
-    No bin holds both directions, whose frictions have opposite signs.
+    No bin contains both directions, in which friction has opposite signs.
     """
     order = np.argsort(qd)
     sides = [s for s in np.split(order, [np.searchsorted(qd[order], 0.0)]) if len(s)]

@@ -33,7 +33,7 @@ def memberships(
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
 ) -> Figure:
-    """Fuzzy sets of velocity and acceleration, a row a joint.
+    """Fuzzy sets of velocity and acceleration, one row per joint.
 
     Args:
         model: a neuro-fuzzy model.
@@ -42,7 +42,7 @@ def memberships(
         unit: of a position, `"rad"` or `"m"`.
 
     Raises:
-        ValueError: if a model is no neuro-fuzzy one, or the two differ in joints or sets.
+        ValueError: if a model is not neuro-fuzzy, or the two differ in joints or sets.
     """
     rules = fuzzy_rules(model)
     drawn = [(rules, _AFTER)]
@@ -77,7 +77,7 @@ def memberships(
 
 
 def fuzzy_rules(model: FrictionModel) -> FuzzyRules:
-    """The model's rules; ValueError where it has none."""
+    """The model's rules; ValueError if it has none."""
     rules = model.schedule.fuzzy_rules()
     if rules is None:
         raise ValueError(
@@ -102,10 +102,10 @@ def draw_map(
     seen: NDArray[np.bool_] | None = None,
     opacity: Array | None = None,
 ) -> None:
-    """Draw a map (y, x) of cells with these edges, or a smooth one of these middles.
+    """Draw a map (y, x) of cells with given edges, or a smooth one with given centres.
 
-    Cells that are not `seen` are a hatched ground, over which others have their `opacity`. The
-    colour bar's `label` is a name and its SI unit.
+    Cells that are not `seen` are hatched; the others are drawn with their `opacity`. The colour
+    bar's `label` is a name and its SI unit.
     """
     shown = values if seen is None else np.ma.masked_where(~seen, values)
     low, high = (float(shown.min()), float(shown.max())) if np.ma.count(shown) else (0.0, 1.0)
@@ -123,7 +123,7 @@ def draw_map(
     )  # fmt: skip
     bar = ax.figure.colorbar(mesh, ax=ax, pad=0.02, aspect=14)
     if opacity is not None:
-        mesh.set(alpha=opacity)  # of the map, not of its bar
+        mesh.set(alpha=opacity)  # for the map, not for its colour bar
     bar.outline.set(linewidth=0.6, edgecolor=style.INK)
     bar.ax.tick_params(colors=style.INK, labelsize=style.SMALL, width=0.6, length=2.0)
     bar.ax.yaxis.set_major_locator(MaxNLocator(5))
@@ -153,12 +153,12 @@ def coefficients_over_time(
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
 ) -> Figure:
-    """Coefficients of models of one law along a motion, a panel a coefficient and joint.
+    """Coefficients of models of one law along a motion, one panel per coefficient and joint.
 
     Args:
-        models: by name, all of as many joints; constant, adaptive or neuro-fuzzy.
+        models: by name, with equally many joints; constant, adaptive or neuro-fuzzy.
         motion: in joint coordinates.
-        law: name of the law whose models are drawn, each in its colour among all; else all are.
+        law: name of the law whose models are drawn, each in its usual colour; by default all.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
 
@@ -211,22 +211,21 @@ def coefficient_surfaces(
     Args:
         model: a neuro-fuzzy model.
         motions: smoothed motions in joint coordinates. White lines enclose 50 % and 90 % of their
-            samples; where they never came near, the map is hatched.
-        uncertainty: of its fit (`FitResult.uncertainty`). A map fades into the hatching as its
-            standard deviation grows, about by half where that is half of the coefficient's mean
-            size.
+            samples; the map is hatched where there are no samples nearby.
+        uncertainty: of its fit (`FitResult.uncertainty`). The map fades into the hatching as the
+            standard deviation grows, to about half when it is half of the coefficient's mean size.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
 
     Returns:
-        A map a joint and fitted coefficient.
+        One map per joint and fitted coefficient.
 
     Raises:
         ValueError: if the model has no fuzzy rules.
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
     names = style.joint_labels(joint_names, model.joints)
-    # The fewer of the two go side by side: the maps with their bars need the room.
+    # The fewer of the two go side by side, because maps with their colour bars need space.
     across = model.joints <= len(coefficients)
     rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
     share = "col" if across else "row"
@@ -243,7 +242,7 @@ def coefficient_surfaces(
         for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
             opacity = None
             if sd is not None:
-                # 1 where all is known, about half at a deviation of `VAGUE`.
+                # 1 without uncertainty, about half at a deviation of `VAGUE`.
                 among = np.abs(values[..., k][... if seen is None or not seen.any() else seen])
                 vague = VAGUE * (float(among.mean()) or 1.0)
                 opacity = _LEAST + (1.0 - _LEAST) / (1.0 + (sd[..., k] / vague) ** 4)
@@ -270,11 +269,11 @@ def coefficient_sections(
 ) -> Figure:
     """Coefficients of a neuro-fuzzy model over |velocity|, at three accelerations.
 
-    Arguments and errors are those of `coefficient_surfaces`. Lines are faint where the motions
-    never came near, bars are 95 % intervals.
+    Arguments and errors are those of `coefficient_surfaces`. Lines are faint where there are no
+    samples nearby; bars are 95 % intervals.
 
     Returns:
-        A panel a joint and fitted coefficient; a joint's accelerations are in its title.
+        One panel per joint and fitted coefficient; titles state the accelerations.
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
     names = style.joint_labels(joint_names, model.joints)
@@ -319,7 +318,7 @@ def coefficient_sections(
 
 
 def _fitted(model: FrictionModel) -> list[tuple[int, Coefficient]]:
-    """Coefficients that networks fit, with their places; the others are the same everywhere."""
+    """Coefficients that networks fit, with their indices; the others are constant."""
     return [(k, c) for k, c in enumerate(model.law.coefficients) if c.fitted and not c.stores]
 
 
@@ -337,7 +336,7 @@ def _middles(edges: Edges) -> Edges:
 
 
 def _levels(edges: Array) -> list[float]:
-    """Three accelerations, about zero where there are both signs."""
+    """Three accelerations, around zero if both signs occur."""
     low, high = float(edges[0]), float(edges[-1])
     middle, step = 0.5 * (low + high), 0.25 * (high - low)
     if low < 0 < high:
@@ -363,7 +362,7 @@ def _on_grid(
 
 
 def _visits(rules: FuzzyRules, motions: Sequence[Motion], joint: int) -> Array:
-    """Samples in each cell (acceleration, speed), those outside the range in the edge's."""
+    """Samples in each cell (acceleration, speed); those outside the range count at the edge."""
     qd, qdd = (np.concatenate([getattr(m, of)[:, joint] for m in motions]) for of in ("qd", "qdd"))
     if rules.along_motion:
         qdd = np.where(qd < 0, -qdd, qdd)
@@ -379,16 +378,16 @@ def _near(counts: Array) -> NDArray[np.bool_]:
 
 
 def _line(ax: Axes, x: Array, y: Array, seen: NDArray[np.bool_], look: dict[str, Any]) -> None:
-    """A line that is faint where nothing was seen."""
+    """A line that is faint where there are no samples."""
     ax.plot(x, np.where(seen, y, np.nan), **look)
     if not seen.all():
-        # The two share a point wherever they meet.
+        # The two parts share a point where they meet.
         unseen = ~seen | ~np.roll(seen, 1) | ~np.roll(seen, -1)
         ax.plot(x, np.where(unseen, y, np.nan), **look | _UNSEEN)
 
 
 def _limit(ax: Axes, values: Array, reach: Array, positive: bool) -> None:
-    """Limits that hold the bars, unless these would hide the lines."""
+    """Limits that include the bars, unless these would hide the lines."""
     low, high = float(values.min()), float(values.max())
     most = max(high - low, abs(low), abs(high)) or 1.0
     bottom = max(float((values - reach).min()), low - most, 0.0 if positive else -np.inf)
@@ -398,7 +397,7 @@ def _limit(ax: Axes, values: Array, reach: Array, positive: bool) -> None:
 
 
 def _density_lines(ax: Axes, middles: Edges, counts: Array) -> None:
-    """Lines around the densest cells that hold half and nine tenths of the samples."""
+    """Lines around the densest cells with 50 % and 90 % of the samples."""
     smooth = gaussian_filter(counts, 2.5)
     falling = np.sort(smooth.ravel())[::-1]
     held = np.cumsum(falling) / falling.sum()
@@ -406,6 +405,6 @@ def _density_lines(ax: Axes, middles: Edges, counts: Array) -> None:
     if levels[0] <= 0 or levels[-1] >= falling[0]:
         return  # all in one cell: no line would enclose anything
     dashes = ["--", "-"][-len(levels) :]
-    # Dark below, so that the lines stand out on light and dark parts of the map alike.
+    # With a dark outline, so that the lines are visible on light and dark parts of the map.
     for colour, width in ((_UNDER, 1.4), (_OVER, 0.7)):
         ax.contour(*middles, smooth, levels, colors=colour, linewidths=width, linestyles=dashes)

@@ -27,7 +27,7 @@ LABEL, SMALL, TINY = 8.0, 7.0, 6.0  # sizes of text [pt]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5D3A9B")
 MEASURED: dict[str, Any] = {"color": "#bcbcbc", "linewidth": 3.0}
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)))
-# Not as many as colours, or both would repeat together.
+# Another number than of colours, or both would repeat together.
 _MARKERS = ("o", "s", "^", "D", "v", "P", "p", "<")
 _HATCHES = ("", "////", "....", "\\\\\\\\")
 MAP = "viridis"
@@ -47,7 +47,7 @@ def panels(
 
 
 def panel_each(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A grid of panels of a height, as many as asked for; the rest of the grid is blank."""
+    """A grid of `count` panels of a given height; the rest of the grid is blank."""
     rows = -(-count // columns)
     figure, axes = panels(rows, columns, width, 0.2 + height * rows)
     for ax in axes.flat[count:]:
@@ -56,7 +56,7 @@ def panel_each(count: int, columns: int, width: float, height: float) -> tuple[F
 
 
 def dress(ax: Axes) -> None:
-    """Colours and sizes, set one by one so that a user's own style cannot make text unreadable."""
+    """Colours and sizes, set explicitly so that a user's own style cannot make text unreadable."""
     ax.set_facecolor("white")
     ax.set_axisbelow(True)
     ax.grid(True, color=GRID, linewidth=0.5, linestyle="-")
@@ -73,7 +73,7 @@ def dress(ax: Axes) -> None:
 def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> None:
     """A legend above all panels, in as many columns as fit; the figure grows by its height.
 
-    Models are labelled by their plain names and abbreviations, other labels stay.
+    Models are labelled with plain names and abbreviations; other labels are unchanged.
     """
     labels = [both_names(label) for label in labels]
     longest = max(len(label) for label in labels)
@@ -98,7 +98,7 @@ def title(ax: Axes, text: str) -> None:
 
 
 def coefficient_axis(ax: Axes, coefficient: Coefficient, position: str, values: Any) -> float:
-    """Label the y axis with a coefficient; the factor from SI to the unit that suits the values."""
+    """Label the y axis with a coefficient; return the factor from SI to the displayed unit."""
     factor, unit = scaled(sliding(coefficient.unit, position), values)
     ax.set_ylabel(f"{symbol(coefficient.name)} [{unit}]")
     ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -119,7 +119,7 @@ def log_axis(ax: Axes, bottom: float, top: float) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """Options of a model's lines, their points and its bars, the same in all figures of a run."""
+    """Style of a model's lines, markers and bars, the same in all figures of a run."""
 
     line: dict[str, Any]
     marker: dict[str, Any]
@@ -132,9 +132,9 @@ class Look:
 
 
 def looks(names: Iterable[str]) -> dict[str, Look]:
-    """A look for each model; no friction is grey whichever others there are."""
+    """A style for each model; no friction is always grey."""
     models = [name for name in names if name != NO_FRICTION]
-    # Fixed, so that colours of models do not depend on whether it was simulated.
+    # Fixed, so that colours of models do not depend on whether no friction was simulated.
     found = {NO_FRICTION: _look(FAINT, (0, (2.5, 2.5)), "x", "xxxx")}
     for k, name in enumerate(models):
         cycles: tuple[Sequence[Any], ...] = (COLOURS, _DASHES, _MARKERS, _HATCHES)
@@ -151,7 +151,7 @@ def _look(colour: str, dashes: Any, marker: str, hatch: str) -> Look:
 
 
 def scaled(unit: str, values: Any) -> tuple[float, str]:
-    """Factor and unit with prefix in which finite values are read easily: small radians as mrad."""
+    """Factor and prefixed unit in which finite values are easy to read: small radians as mrad."""
     sizes = np.abs(np.asarray(values, dtype=np.float64))
     largest = float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
     if unit in ("", "1", "-") or largest == 0.0 or largest >= 0.2:
@@ -160,12 +160,12 @@ def scaled(unit: str, values: Any) -> tuple[float, str]:
 
 
 def sliding(unit: str, position: str) -> str:
-    """A revolute joint's unit as it reads for positions in `"rad"` or `"m"`."""
+    """A revolute joint's unit, adapted to positions in `"rad"` or `"m"`."""
     return unit if position == "rad" else unit.replace("N m", "N").replace("rad", position)
 
 
 def symbol(name: str) -> str:
-    """A coefficient's name as print writes it: `f_o` with its index below, `B` in italics."""
+    """A coefficient's name in mathematical type: `f_o` with a subscript, `B` in italics."""
     match = re.fullmatch(r"([A-Za-z])(?:_([A-Za-z0-9]+))?", name)
     if match is None:
         return name
@@ -174,14 +174,14 @@ def symbol(name: str) -> str:
 
 
 def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
-    """The names given, or joint1, joint2, ...; ValueError if there is not one for each joint."""
+    """The given names, or joint1, joint2, ...; ValueError if there is not one for each joint."""
     if names is not None and len(names) != joints:
         raise ValueError(f"`joint_names` must be {joints} names, got {list(names)}.")
     return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]
 
 
 def spread(values: Any) -> float:
-    """Largest finite value over the smallest positive one; 1 where there are none."""
+    """Largest finite value over the smallest positive one; 1 if there are none."""
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known) & (known > 0)]
     return float(known.max() / known.min()) if known.size else 1.0

@@ -1,7 +1,7 @@
 """Angle conventions of recordings, and their conversion to joint coordinates and back.
 
 Joint coordinates: the first link's angle from upright (0 is up), every further link's angle
-relative to the link before it. A free arm's angle about the vertical comes first and has no
+relative to the previous link. A free arm's angle about the vertical comes first and has no
 convention.
 """
 
@@ -45,8 +45,8 @@ class AngleConvention:
     Angles are not wrapped or unwrapped. Torques are joint torques in every convention.
 
     Args:
-        angles: of every link, relative to the link before it or absolute, to the vertical.
-        measured_from: zero of the angles to the vertical.
+        angles: of every link, relative to the previous link, or absolute, from the vertical.
+        measured_from: zero of the angles from the vertical.
     """
 
     angles: Angles = "relative"
@@ -63,12 +63,12 @@ class AngleConvention:
     def of(cls, given: ConventionLike) -> AngleConvention:
         """Convention of a plant, or from words such as "absolute,hanging" or "relative-upright".
 
-        Words come in one string or several, in any order; one that is left out takes its default.
+        Words come in one or several strings, in any order; an omitted one takes its default.
 
         Raises:
-            ValueError: an unknown or doubled word, or anything else.
+            ValueError: an unknown or repeated word, or any other value.
         """
-        # By attribute: recordings must not import plants.
+        # By attribute, because recordings must not import plants.
         found = getattr(given, "convention", given)
         if isinstance(found, cls):
             return found
@@ -95,10 +95,10 @@ class AngleConvention:
 
         Args:
             q: positions [rad], joints on the last axis.
-            first_link: column of the first link; columns before it (a free arm) stay as they are.
+            first_link: column of the first link; columns before it (a free arm) are unchanged.
         """
         joint = self.rate_to_joint(q, first_link)
-        # It cancels in the differences of absolute angles.
+        # The zero cancels in the differences of absolute angles.
         joint[..., first_link : first_link + 1] += self._first_zero
         return joint
 
@@ -112,7 +112,7 @@ class AngleConvention:
         """Joint rates of rates (velocities or accelerations) in this convention."""
         qd = _links(qd, first_link)
         if self.angles == "absolute":
-            # The first link has none before it: absolute and relative agree.
+            # The first link has no previous link, so that absolute and relative agree.
             qd[..., first_link + 1 :] = np.diff(qd[..., first_link:], axis=-1)
         return qd
 

@@ -29,7 +29,7 @@ Unit = Literal["rad", "m"]
 
 
 class RecordingWarning(UserWarning):
-    """A recording is valid but looks as if its units were not SI, lacks columns, or has gaps."""
+    """A recording is valid, but its units look wrong, columns are missing, or it has gaps."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,14 +37,14 @@ class Recording:
     """Positions of a mechanism's joints over time, with torque and velocity where measured.
 
     Arrays are copied to read-only float64. Irregular time stamps are allowed and kept. Two
-    recordings hold the same data when their `digest()` agree.
+    recordings contain the same data if their `digest()` is equal.
 
-    Without a convention, angles are read as the plant's encoders write them. Motion simulated in
-    joint coordinates needs `convention="relative,upright"`.
+    Without a convention, angles are in that of the plant's encoders. Motion simulated in joint
+    coordinates needs `convention="relative,upright"`.
 
     Args:
         time: [s], increasing, shape (time,).
-        q: position [rad, or m by `unit`], shape (time, joint).
+        q: position [rad or m, as `unit` states], shape (time, joint).
         tau: joint torque [N m, or N], shape like `q`.
         qd: measured velocity [rad/s, or m/s], shape like `q`.
         names: one name per joint, "joint1" … by default.
@@ -99,14 +99,14 @@ class Recording:
 
     @property
     def segments(self) -> list[tuple[int, int]]:
-        """First and last sample of each stretch without a gap in time, two samples at least."""
+        """First and last sample of each part without a gap in time, at least two samples long."""
         pauses = gaps(self.time).tolist()
         first, last = [0, *(k + 1 for k in pauses)], [*pauses, len(self.time) - 1]
         return [(a, b) for a, b in zip(first, last, strict=True) if a < b]
 
     @property
     def longest_step(self) -> float:
-        """Longest step between samples, gaps aside [s]."""
+        """Longest step between samples except gaps [s]."""
         return float(np.delete(np.diff(self.time), gaps(self.time)).max())
 
     @property
@@ -133,8 +133,8 @@ class Recording:
             samples = np.asarray(samples)
             if samples.dtype != np.bool_ or samples.shape != self.time.shape:
                 raise TypeError(
-                    f"a recording is cut by a slice of samples or by {len(self)} times True or "
-                    f"False, got {samples.dtype} of shape {samples.shape}; columns are "
+                    f"a recording is indexed by a slice of samples or a mask of {len(self)} "
+                    f"booleans, got {samples.dtype} of shape {samples.shape}; columns are "
                     f"`recording.q[:, k]`."
                 )
         tau = None if self.tau is None else self.tau[samples]
@@ -142,7 +142,7 @@ class Recording:
         return self._replace(time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
 
     def _replace(self, **changes: Any) -> Recording:
-        """A copy with changes, without the warnings that this recording has given."""
+        """A changed copy that does not repeat this recording's warnings."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
             return replace(self, **changes)
@@ -151,12 +151,12 @@ class Recording:
         """The recording's own convention, else the plant's; for sliding joints the default one.
 
         Raises:
-            ValueError: the recording is in metres and the plant turns, or the other way round.
+            ValueError: the recording is in metres and the plant's joints turn, or vice versa.
         """
         if self.unit != plant.unit:
             raise ValueError(
                 f"{self.name or 'the recording'} is in {self.unit}, the plant's joints are in "
-                f"{plant.unit}; read it with `unit={plant.unit!r}` if it is, too."
+                f"{plant.unit}; if the recording is, too, read it with `unit={plant.unit!r}`."
             )
         if self.unit == "m":
             return AngleConvention()
@@ -166,8 +166,8 @@ class Recording:
         """The same motion in joint coordinates: first angle from upright, the others relative.
 
         Args:
-            plant: the recorded one; optional where the recording has a convention and its first
-                column is a link's.
+            plant: the recorded one; optional if the recording has a convention and its first
+                column is that of a link.
         Raises:
             ValueError: neither recording nor plant have a convention, or their units differ.
         """
@@ -177,22 +177,22 @@ class Recording:
         if convention is None:
             raise ValueError(
                 "the recording has no angle convention; give the plant, or read "
-                "it with convention='absolute,hanging' or the like."
+                "it with, for example, convention='absolute,hanging'."
             )
-        # Without a plant the first column is taken as a link, not as an arm.
+        # Without a plant the first column is taken to be a link, not an arm.
         first_link = 0 if plant is None else plant.first_link
         qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
         q = convention.position_to_joint(self.q, first_link)
         return self._replace(q=q, qd=qd, convention=AngleConvention())
 
     def advance_torque(self, delay: float) -> Recording:
-        """The recording with its torque taken `delay` [s] earlier, negative for later.
+        """The recording with its torque shifted `delay` [s] earlier; later if negative.
 
-        For torques that reach the log later than the positions, by a bus or a filter. Samples for
-        which no torque is known are cut off; torques between samples are interpolated.
+        For torques that a bus or a filter logs later than the positions. Samples for which no
+        torque is known are cut off; torques between samples are interpolated.
 
         Raises:
-            ValueError: without torque, or if the delay leaves fewer than 8 samples.
+            ValueError: there is no torque, or the delay leaves fewer than 8 samples.
         """
         if self.tau is None:
             raise ValueError(f"{self.name or 'the recording'} has no torque to advance.")
@@ -201,7 +201,7 @@ class Recording:
         return self._replace(tau=self.torque_at(at))[known]
 
     def torque_at(self, time: Array) -> Array:
-        """Torque between samples by interpolation, held beyond the ends, (time, joint)."""
+        """Torque interpolated between samples and held beyond the ends, (time, joint)."""
         if self.tau is None:
             return np.zeros((len(time), self.joints))
         return np.stack([np.interp(time, self.time, column) for column in self.tau.T], 1)
@@ -214,7 +214,7 @@ class Recording:
             values = getattr(self, key)
             digest.update(f"{key} {None if values is None else values.shape}".encode())
             if values is not None:
-                # Adding zero makes -0.0 the 0.0 it equals.
+                # Adding zero turns -0.0 into 0.0, which it equals.
                 digest.update((values + 0.0).astype("<f8").tobytes())
         return digest.hexdigest()
 
@@ -234,7 +234,7 @@ class Recording:
         return table
 
     def plot(self) -> Figure:
-        """Positions over time, a panel a joint; see `plots.motion`."""
+        """Positions over time, one panel per joint; see `plots.motion`."""
         # By name, because plots is a layer above this one.
         figure: Figure = resolve_name("nfriction.plots:motion")(self)
         return figure
@@ -253,27 +253,27 @@ class Recording:
     ) -> Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
-        Of several joints those without a torque are undriven: theirs is zero where another has
-        one. Velocity is taken where every joint has it; other columns are ignored. In place of q1
-        and tau1 the table may have motor1, the angle of the joint's motor [rad], and current1 [A],
-        which the plant's `Motor` converts.
+        If some joints have a torque, the others are taken to be undriven, with zero torque.
+        Velocity is used if every joint has it; other columns are ignored. In place of q1 and tau1
+        the table may have motor1, the angle of the joint's motor [rad], and current1 [A], which the
+        plant's `Motor` converts.
 
         Args:
-            table: a row per sample.
-            columns: the table's name for ours where they differ, perhaps with its unit after a
-                colon, {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg,
-                rev, counts/8192 (any number a revolution), m, mm; these per second, rpm; N m,
-                mN m, N, mN; A, mA.
+            table: one row per sample.
+            columns: the table's names for ours, optionally with a unit after a colon,
+                {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg, rev,
+                counts/8192 (any number per revolution), m, mm; these per second, rpm; N m, mN m,
+                N, mN; A, mA.
             degrees: positions and velocities without a unit are in degrees.
             convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
-                `AngleConvention`, or a plant; else `table.attrs["convention"]`, else None: that
-                of the plant in whose fit or score the recording is used.
-            unit: of position; else `table.attrs["unit"]`, else the plant's, else rad.
+                `AngleConvention`, or a plant; by default `table.attrs["convention"]`, or None for
+                that of the plant in whose fit or score the recording is used.
+            unit: of position; by default `table.attrs["unit"]`, the plant's, or rad.
             name: of the recording.
             plant: the mechanism, for its motors.
         Warns:
-            RecordingWarning: velocity or torque of some joints only, columns that look like torque
-                and are not read; and as `Recording`.
+            RecordingWarning: velocity or torque of some joints only, unread columns that look like
+                torque; and as `Recording`.
         """
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
@@ -287,22 +287,22 @@ class Recording:
             angles = AngleConvention.of(plant if convention is None else convention).angles
             if angles == "absolute":
                 raise ValueError(
-                    "motors turn their joints, so their angles are relative to the link before, "
+                    "motors turn their joints, so their angles are relative to the previous link, "
                     "but the convention is absolute; give a relative one, such as "
                     "`convention=('relative', 'hanging')`."
                 )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
-        # "deg" is the file's own word for what `degrees` states.
+        # "deg" in the file means the same as `degrees`.
         written = None if degrees and attributes.get("unit") == "deg" else attributes.get("unit")
         unit = unit or written or found or ("m" if plant and plant.unit == "m" else "rad")
         if found and found != unit:
             raise ValueError(
                 f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
             )
-        # Angles of motors are converted before their screws make them lengths.
+        # Angles of motors are converted before their screws turn them into lengths.
         if degrees and unit == "m" and (not of_motors or "qd" in arrays):
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
-        # One text, for CSV comments and Parquet metadata hold no lists.
+        # One text, because CSV comments and Parquet metadata cannot contain lists.
         names = [part.strip() for part in str(attributes.get("names", "")).split(",")]
         recording = cls(
             time=arrays["time"],
@@ -337,24 +337,24 @@ class Recording:
 
         A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
         arguments override the file. Cells may be separated by commas, semicolons, tabs or blanks,
-        as the header is; numbers may have decimal commas, and thousands separated by the other
-        sign. If all are like `35,000`, a unit in counts or a line `# decimal: .` decides; without,
-        it is guessed with a warning. A row of units under the header, or units in it as in
-        `time [ms]`, are followed. Arrays of .mat and .h5 files are named by their path,
-        `data.Y.q1`, `enc[0]`; signals of dSPACE ControlDesk by their names. The name is the file's
-        without its ending.
+        like the header; numbers may have decimal commas, and thousands separated by the other
+        sign. If all are like `35,000`, a unit in counts or a line `# decimal: .` decides; otherwise
+        the sign is guessed with a warning. Units in a row under the header, or in the header as in
+        `time [ms]`, are used. Arrays of .mat and .h5 files are named by their path, `data.Y.q1`,
+        `enc[0]`; signals of dSPACE ControlDesk by their names. The recording is named after the
+        file, without its ending.
 
         Args:
             path: of the file.
             columns, degrees, convention, unit, name, plant: as for `from_pandas`.
         Warns:
-            RecordingWarning: a decimal sign that is guessed; and as `from_pandas`.
+            RecordingWarning: a guessed decimal sign; and as `from_pandas`.
         Raises:
             FileNotFoundError: there is no such file.
             ImportError: a format whose library is not installed.
             ValueError: broken content or missing columns; names the file.
         """
-        # Before the file is read, so that a wrong argument does not blame the file.
+        # Before the file is read, so that the message for a wrong argument does not name the file.
         if convention is not None:
             convention = AngleConvention.of(convention)
         table = formats.read_table(path, list((columns or {}).values()))
@@ -382,18 +382,18 @@ class Recording:
             plant: see `from_pandas`.
             name: of a recording from a table.
         Raises:
-            TypeError: for anything else; arrays are given by `Recording(time, q)`.
+            TypeError: for anything else; for arrays use `Recording(time, q)`.
         """
         if isinstance(given, Recording):
             return given
         if isinstance(given, str | os.PathLike):
             return cls.read(given, plant=plant)
-        # A table has columns and attributes; pandas is slow to import only to ask.
+        # Recognises a table without importing pandas, which is slow.
         if not (hasattr(given, "columns") and hasattr(given, "attrs")):
             raise TypeError(
                 "a recording is a Recording, the path of a file, or a table with columns time, q1, "
                 f"…, got {type(given).__name__} {reprlib.repr(given)}; `Recording(time, q)` makes "
-                "one of arrays."
+                "one from arrays."
             )
         return cls.from_pandas(given, plant=plant, name=name)
 
@@ -405,8 +405,8 @@ class Recording:
         plant: Mechanism | None = None,
         name: str = "table",
     ) -> list[Recording]:
-        """Recordings of one or several of what `of` takes; tables are called `name` 1, 2, …."""
-        # A path iterates over its letters, a table over its columns.
+        """Recordings from one or several arguments of `of`; tables are called `name` 1, 2, …."""
+        # Iteration over a path gives its letters, over a table its columns.
         single = isinstance(given, Recording | str | os.PathLike) or hasattr(given, "columns")
         listed: Iterable[Any] = [given]
         if not single and isinstance(given, Iterable):
@@ -414,11 +414,11 @@ class Recording:
         return [cls.of(one, plant=plant, name=f"{name} {k}") for k, one in enumerate(listed, 1)]
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write to .csv, .csv.gz, .parquet or .npz atomically; `read` gives it back."""
+        """Write to .csv, .csv.gz, .parquet or .npz atomically; `read` restores it."""
         formats.write_table(self.to_pandas(), path)
 
     def _warn(self, finding: str, remedy: str, *, stacklevel: int) -> None:
-        # Of many recordings the reader must know which one.
+        # With many recordings the message must name the one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)
 
@@ -432,7 +432,7 @@ def read_initial_states(
 ) -> dict[str, tuple[Array, Array]]:
     """Initial position and velocity per recording from a table with columns id, q0_1, qd0_1, ….
 
-    Cells of joints that a mechanism lacks are empty. Angles are in the recordings' convention.
+    Cells for joints that a mechanism lacks are empty. Angles are in the recordings' convention.
 
     Args:
         path: of the table, such as a data set's `recordings.csv`.
@@ -440,7 +440,7 @@ def read_initial_states(
     Returns:
         {id: (q0, qd0)} in SI, each (joint,).
     Raises:
-        ValueError: missing columns, or a state that is incomplete or comes twice.
+        ValueError: missing columns, or an incomplete or repeated state.
     """
     table = formats.read_table(path)
     joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_[0-9]{1,4}", c)), key=int)
@@ -465,7 +465,7 @@ def read_initial_states(
         if lost or not label:
             raise ValueError(f"'{path}': row {row + 1} has no id.")
         state = np.stack([q0[row], qd0[row]])
-        # Mechanisms of one table may have fewer joints than it has columns.
+        # Some mechanisms of a table may have fewer joints than the table has columns.
         present = ~np.isnan(state[0])
         sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()
         if label in states or not present.any() or not sound:
@@ -475,7 +475,7 @@ def read_initial_states(
             )
         states[label] = (state[0, present], state[1, present])
     if not states:
-        raise ValueError(f"'{path}' has no rows; write one with {', '.join(wanted)} a recording.")
+        raise ValueError(f"'{path}' has no rows; write one per recording with {', '.join(wanted)}.")
     return states
 
 

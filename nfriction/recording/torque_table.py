@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Other names of our columns, with the joint's number behind them or none.
+# Other names of our columns, optionally followed by the joint's number.
 _NAMES = {
     "time": "time",
     "q": "q|position",
@@ -37,16 +37,16 @@ _NAMES = {
 _KEYS = {
     key: re.compile(rf"(?:{names})_?([1-9]\d{{0,3}})?", re.ASCII) for key, names in _NAMES.items()
 }
-# Units are those of positions, velocities, torques and times; others are taken as they are.
+# Columns whose units are those of times, positions or torques; others are not converted.
 _KIND = {"time": "time", "q": "q", "qd": "qd", "tau": "tau", "load": "tau"}
 _PER_JOINT = ("q", "qd", "qdd", "tau", "load", "temperature")
-# Usual names, without a unit behind.
+# Usual names, without a unit.
 _LIKE = {
     "qd": re.compile(r"(speed|vel|omega|drehzahl|geschw)", re.IGNORECASE),
     "tau": re.compile(r"[^\[(]*(torque|moment|tau|force|kraft|friction)", re.IGNORECASE),
 }
 MINIMUM_ROWS = 8
-# Joints faster than this are in degrees per second, or wheels [rad/s].
+# Faster joints are in degrees per second, or wheels [rad/s].
 FAST = 60.0
 
 
@@ -58,10 +58,10 @@ class JointTorque:
         name: of the joint.
         qd: velocity [rad/s; m/s], (row,).
         tau: friction torque, of the sign of the velocity [N m; N], (row,).
-        time: increasing [s], (row,); None for rows in no order, such as constant-velocity tests.
+        time: increasing [s], (row,); None for unordered rows, such as constant-velocity tests.
         q: position [rad; m], (row,), or None.
         qdd: acceleration [rad/s^2; m/s^2], (row,); zero where it is unknown.
-        load: normal load in any unit, (row,), or None; load-dependent laws take it as it is.
+        load: normal load in any unit, (row,), or None; load-dependent laws use it unscaled.
         temperature: in any unit, (row,), or None.
     """
 
@@ -79,7 +79,7 @@ class JointTorque:
 
     @property
     def step(self) -> float:
-        """Median time between rows [s]; 1 of rows in no order."""
+        """Median time between rows [s]; 1 for unordered rows."""
         return 1.0 if self.time is None else float(np.median(np.diff(self.time)))
 
     def rows(self, index: NDArray[Any]) -> JointTorque:
@@ -164,20 +164,20 @@ class TorqueTable:
     ) -> TorqueTable:
         """Table from columns qd and tau, perhaps time, q, qdd, load, temperature and joint.
 
-        With a column joint the rows of each joint are taken apart; without, qd1, tau1, qd2, tau2,
-        ... are those of several joints. `tau_f`, `friction` and `torque` are read as tau,
-        `position`, `velocity`, `acceleration` and `normal_force` likewise. Where time and q are
-        given but not qd, velocity and acceleration come from smoothed positions.
+        A column joint separates the rows of several joints; without it, qd1, tau1, qd2, tau2, ...
+        are theirs. `tau_f`, `friction` and `torque` are read as tau, and likewise `position`,
+        `velocity`, `acceleration` and `normal_force`. If time and q are given but not qd, velocity
+        and acceleration come from smoothed positions.
 
         Args:
-            table: units in its header, as in `qd [deg/s]`, are followed.
-            columns: the table's name for ours where they differ, perhaps with a unit: "vel:deg/s".
+            table: units in its header, as in `qd [deg/s]`, are used.
+            columns: the table's names for ours, optionally with a unit: "vel:deg/s".
             degrees: positions and velocities are in degrees.
             unit: of positions, `"rad"` or `"m"`.
-            torque: False reads a table without tau, too, to predict its torque; it is NaN then.
+            torque: False also accepts a table without tau, to predict its torque; tau is then NaN.
 
         Raises:
-            ValueError: a column that is missing, or no number in every row; time that does not
+            ValueError: a column that is missing or lacks numbers in some rows; time that does not
                 increase; a joint that does not move.
         """
         if unit not in ("rad", "m"):
@@ -237,7 +237,7 @@ def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tupl
             own = aliases.get(name, name)
             if key in found and found[key][0] != own:
                 raise ValueError(
-                    f"columns {found[key][0]} and {own} both are {key[0]}; rename one of them, or "
+                    f"columns {found[key][0]} and {own} are both {key[0]}; rename one of them, or "
                     f'name the one to read with columns={{"{key[0]}": "..."}}.'
                 )
             found[key] = (own, units.get(own))
@@ -246,8 +246,8 @@ def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tupl
         source = parse_source(spec, names) or parse_source(spec, set(aliases))
         if key is None:
             raise ValueError(
-                f"`columns` maps {', '.join(_NAMES)}, with the number of a joint behind, to the "
-                f"file's names, got the key {ours!r}."
+                f"`columns` maps {', '.join(_NAMES)}, optionally followed by a joint's number, to "
+                f"the file's names, got the key {ours!r}."
             )
         if source is None:
             raise ValueError(_missing(table, ours, f"no column {spec!r}"))
@@ -257,7 +257,7 @@ def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tupl
 
 
 def _require_unit(unit: Unit, sources: Mapping[_Key, tuple[str, str | None]]) -> None:
-    """Raise ValueError where a column's own unit is not of such positions."""
+    """Raise ValueError if a column's own unit contradicts the unit of positions."""
     for (key, _), (column, own) in sources.items():
         if key in ("q", "qd") and own and is_unit(own):
             found = "m" if slides(canonical_unit(own).removesuffix("/s")) else "rad"
@@ -280,7 +280,7 @@ def _key(name: str) -> _Key | None:
 def _missing(table: pd.DataFrame, wanted: str, what: str) -> str:
     found = [str(name)[:60] for name in table.columns][:30]
     shown = ", ".join(found)
-    # For this advice only: what is read is always named by the user.
+    # Only for this advice: columns to be read are always named by the user.
     guessed = {}
     for key, words in _LIKE.items():
         near = [n for n in found if words.match(n) and _key(n) is None and not set(n) & set('",=:')]
@@ -306,7 +306,7 @@ def _parts(
         raise ValueError(_missing(table, "tau", "no column of friction torque"))
     for n in numbers:
         known = {key for key, number in sources if number == n}
-        # Velocity comes from positions where there are stamps.
+        # Velocity comes from positions if there are time stamps.
         if "qd" not in known and not ("q" in known and ("time", 0) in sources):
             own = f"qd{n}" if n else "qd"
             raise ValueError(_missing(table, own, f"column {own} is missing"))
@@ -315,8 +315,8 @@ def _parts(
         return
     if numbers != [0]:
         raise ValueError(
-            "a table with a column joint has one qd and one tau, this one has tau"
-            f"{numbers[-1]}, too; drop the column joint."
+            "a table with a column joint has one qd and one tau, but this one also has tau"
+            f"{numbers[-1]}; drop the column joint."
         )
     column = table[sources["joint", 0][0]]
     if column.isna().any():
@@ -356,7 +356,7 @@ def _numbers(
 
 
 def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> JointTorque:
-    """The rows of a joint, checked; velocity from positions where none is given."""
+    """The rows of a joint, checked; velocity from positions if none is given."""
     time, q, qd, qdd, tau = (of[key] for key in ("time", "q", "qd", "qdd", "tau"))
     if tau is None:
         given = qd if qd is not None else q
@@ -368,7 +368,7 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         k = int(np.flatnonzero(np.diff(time) <= 0)[0])
         raise ValueError(
             f"time of {name} must increase from row to row, got {time[k]:g} s and then "
-            f"{time[k + 1]:g} s; sort the rows, or drop the column time if they are in no order."
+            f"{time[k + 1]:g} s; sort the rows, or drop the column time if they are unordered."
         )
     if qd is None:
         assert time is not None
@@ -383,19 +383,19 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
             f"{name} does not move: its velocity is zero in every row, so friction has no "
             "direction; record motion in both directions."
         )
-    # Slower than a thousandth of the largest is no motion in a direction of its own.
+    # Slower than a thousandth of the largest velocity does not count as motion in a direction.
     ways = [float(np.mean(sign * qd > 1e-3 * largest)) for sign in (1, -1)]
     if min(ways) == 0.0:
         remarks.append(
             f"{name} moves in one direction only: an offset cannot be separated from Coulomb "
-            "friction, and nothing is known of the other direction."
+            "friction, and nothing is known about the other direction."
         )
     if np.ptp(tau) == 0.0:
         raise ValueError(f"the friction torque of {name} is {tau[0]:g} in every row.")
     if float(tau @ qd) < 0.0:
         remarks.append(
-            f"The friction torque of {name} drives the joint on average, as one of the wrong sign "
-            "does: it is read as positive with positive velocity. If so, reverse it."
+            f"The friction torque of {name} drives the joint on average, as with the wrong sign: "
+            "it must be positive with positive velocity. If the sign is wrong, reverse it."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
 
@@ -417,7 +417,7 @@ def _derivatives(time: Array, q: Array, qdd: Array | None) -> tuple[Array, Array
 
 
 def as_table(table: Any, **options: Any) -> TorqueTable:
-    """A table as it is, or of a path or DataFrame; options as of `TorqueTable.from_pandas`."""
+    """A table, also from a path or DataFrame; options as for `TorqueTable.from_pandas`."""
     if isinstance(table, TorqueTable):
         return table
     if isinstance(table, (str, os.PathLike)):
@@ -432,8 +432,8 @@ def as_table(table: Any, **options: Any) -> TorqueTable:
 def blocks(joint: JointTorque, count: int) -> list[NDArray[np.intp]]:
     """Rows of each of `count` blocks that are left out in turn.
 
-    Contiguous blocks of rows that are ordered in time; others are dealt by their velocity, so that
-    a block left out lies between the rest.
+    Rows ordered in time form contiguous blocks; others are assigned by their velocity, so that a
+    block left out lies between the rest.
     """
     if joint.time is not None:
         return list(np.array_split(np.arange(len(joint)), count))

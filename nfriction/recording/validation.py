@@ -1,4 +1,4 @@
-"""Requirements on recorded arrays, and signs that their units or stamps are wrong."""
+"""Requirements on recorded arrays, and signs that their units or time stamps are wrong."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 MINIMUM_SAMPLES = 8
-# No measurement is larger in any unit; squares and differences of it are finite.
+# No measurement is larger in any unit; its squares and differences are finite.
 LARGEST_VALUE = 1e30
-# No recording lasts eleven days: such a stamp is a clock's [s].
+# No recording lasts eleven days: a larger stamp comes from a clock [s].
 LARGE_STAMP = 1e6
 
 
@@ -36,14 +36,14 @@ def gaps(time: Array) -> NDArray[np.intp]:
 def read_only(values: ArrayLike, key: str) -> Array:
     """A read-only float64 copy."""
     try:
-        # First as it is: a tensor does not know `copy`.
+        # `asarray` first, because a tensor does not accept `copy`.
         array = np.array(np.asarray(values), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"`{key}` must be a rectangular array of numbers ({error}); "
             f"every sample needs a number for every joint."
         ) from error
-    # Recordings are shared between fits, and a digest must stay true.
+    # Recordings are shared between fits, and their digest must stay valid.
     array.setflags(write=False)
     return array
 
@@ -71,13 +71,13 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
             )
     if len(names) != q.shape[1] or len(set(names)) < len(names):
         raise ValueError(f"`names` must name each of {q.shape[1]} joints once, got {names}.")
-    # Names are written in CSV headers and comments, and must come back from them.
+    # Names are written in CSV headers and comments, and must be recovered from them.
     if any(not re.fullmatch(r"[^\s,#]([^,#\n]*[^\s,#])?", name) for name in names):
         raise ValueError(f"`names` must be free of commas, # and outer blanks, got {names}.")
     if unit not in ("rad", "m"):
         raise ValueError(
             f"`unit` must be 'rad' or 'm', got {unit!r}; "
-            f"degrees are converted by `Recording.read(..., degrees=True)`."
+            f"`Recording.read(..., degrees=True)` converts degrees."
         )
     if len(time) < MINIMUM_SAMPLES:
         raise ValueError(
@@ -88,16 +88,16 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
         if values is not None:
             _check_values(key, values)
     _check_stamps(time)
-    # No encoder's step is a radian.
+    # No encoder has steps of a radian.
     if unit == "rad" and np.ptp(q) > 1 and (q == np.rint(q)).all():
         raise ValueError(
-            f"`q` must be in radians, got whole numbers alone, from {q.min():g} to {q.max():g}; "
-            "state the unit: counts of a turn by the column, as in q1=q1:counts/8192, or degrees."
+            f"`q` must be in radians, got only whole numbers, from {q.min():g} to {q.max():g}; "
+            "state the unit: counts per turn with the column, as in q1=q1:counts/8192, or degrees."
         )
 
 
 def _check_values(key: str, values: Array) -> None:
-    # The negation is true of NaN, too.
+    # The negation also catches NaN.
     bad = np.argwhere(~(np.abs(values) <= LARGEST_VALUE))
     if len(bad):
         sample, *joint = bad[0]
@@ -106,7 +106,7 @@ def _check_values(key: str, values: Array) -> None:
         rule = f"within {LARGEST_VALUE:g}" if np.isfinite(value) else "finite"
         raise ValueError(
             f"`{label}` must be {rule}, got {value} at sample {sample} "
-            f"({len(bad)} in all); drop such rows with their times, a recording may lack samples."
+            f"({len(bad)} in all); drop such rows with their times, since samples may be missing."
         )
 
 
@@ -117,8 +117,8 @@ def _check_stamps(time: Array) -> None:
         before, after = float(time[k]), float(time[k + 1])
         remedy = "sort the rows and drop repeated stamps"
         if before == after and abs(after) >= LARGE_STAMP:
-            # A clock's stamps have many digits, of which the logger wrote fewer.
-            remedy = "write so large stamps with more digits, or count from the recording's start"
+            # The stamps of a clock have more digits than the logger wrote.
+            remedy = "write large stamps with more digits, or count from the recording's start"
         raise ValueError(
             f"`time` must increase, got {before!r} then {after!r} s at sample {k + 1} "
             f"({len(stuck)} such steps); {remedy}."
@@ -126,10 +126,10 @@ def _check_stamps(time: Array) -> None:
 
 
 def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[tuple[str, str]]:
-    """Signs that units or stamps are wrong, each with its remedy."""
+    """Signs that units or time stamps are wrong, each with its remedy."""
     step = np.diff(time)
     pauses = gaps(time)
-    # A joint's motion cannot be seen at two samples a second.
+    # A joint's motion cannot be observed at two samples per second.
     slow = bool(np.median(step) >= 0.5)
     if slow:
         yield (
@@ -140,31 +140,31 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
         k = int(pauses[np.argmax(step[pauses])])
         yield (
             f"`time` has gaps ({len(pauses)}), the longest of {step[k]:.4g} s at {time[k]:.6g} s",
-            "no simulation crosses them; each starts anew behind one",
+            "no simulation crosses them; a new one starts after each",
         )
     held = held_samples(q)
     if (held > 1).any():
         slow_joints = ", ".join(name for name, n in zip(names, held, strict=True) if n > 1)
         rows = int(held.max())
         yield (
-            f"each position of {slow_joints} is repeated for about {rows} samples, as by a "
-            "sensor that is slower than the log",
-            f"if so, keep the rows with new values, as `recording[::{rows}]` does: repeated "
-            "ones look like a joint that stops and jumps",
+            f"each position of {slow_joints} is repeated for about {rows} samples, probably "
+            "because the sensor is slower than the log",
+            f"if so, keep only rows with new values, as `recording[::{rows}]` does: repeated "
+            "values look like a joint that stops and jumps",
         )
     if unit == "m":
         return
-    # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and of a whirling chain
-    # the first link seldom goes round. So joints that all pass a full turn and one of them 30 rad/s
-    # are driven wheels, or in degrees. Wrapped angles never span more than a turn.
+    # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and the first link of a
+    # whirling chain seldom turns over. So if all joints exceed a full turn and one of them 30
+    # rad/s, they are driven wheels, or in degrees. Wrapped angles never span more than a turn.
     turns = np.ptp(q, axis=0).min() / (2 * np.pi)
-    with np.errstate(over="ignore"):  # stamps may be as close as numbers get
+    with np.errstate(over="ignore"):  # stamps may be arbitrarily close
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
     if turns > 1 and speed > 30.0 and not slow:
         yield (
             f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
             f"times, at up to {speed:.0f} rad/s)",
-            "if so, read it with `degrees=True`, or state the counts of a turn, as in "
+            "if so, read it with `degrees=True`, or state the counts per turn, as in "
             'columns={"q1": "q1:counts/8192"}',
         )
     jumps = turns_between_samples(q, pauses)
@@ -177,10 +177,10 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
 
 
 def held_samples(q: Array) -> NDArray[np.intp]:
-    """Samples for which each new position is held, (joint,); 1 where it changes as the joint does.
+    """Samples for which each new position is held, (joint,); 1 if values are not repeated.
 
-    A joint that moves by two counts or more from a sample to the next hardly rests at the samples
-    before and after. Where most such steps lie between two samples of rest, values are repeated.
+    A joint that moves by two counts or more from one sample to the next hardly rests at the samples
+    before and after. If most such steps lie between two samples of rest, values are repeated.
     """
     held = np.ones(q.shape[1], dtype=np.intp)
     for joint, step in enumerate(np.abs(np.diff(q, axis=0)).T):
@@ -192,7 +192,7 @@ def held_samples(q: Array) -> NDArray[np.intp]:
 
 
 def turns_between_samples(q: Array, pauses: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Jumps of about a turn between short steps, (joint,): no joint starts and stops so fast."""
+    """Jumps of about a turn between small steps, (joint,): no joint starts and stops so fast."""
     step = np.abs(np.diff(q, axis=0))
     # Across a gap any number of turns is possible.
     step[pauses] = 0.0

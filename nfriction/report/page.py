@@ -48,7 +48,7 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of one input: its name in words, middle and standard deviation in SI."""
+    """A fuzzy set of one input: its name in words, centre and standard deviation in SI units."""
 
     name: str
     centre: float
@@ -57,9 +57,9 @@ class Term:
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule: the names of its terms, and the coefficients in SI where these hold fully.
+    """One rule: the names of its terms, and the coefficients at their centres in SI units.
 
-    The values are those of the whole model, neighbouring rules and radial basis head included.
+    The values are those of the whole model, including neighbouring rules and radial basis head.
     """
 
     velocity: str
@@ -82,7 +82,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class JointRules:
-    """Sets and rules of one joint; velocity's set by velocity's set, acceleration's faster."""
+    """Sets and rules of one joint; in the list of rules the acceleration varies faster."""
 
     joint: str
     velocity: tuple[Term, ...]
@@ -91,9 +91,9 @@ class JointRules:
 
 
 def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> list[JointRules]:
-    """The rules of a neuro-fuzzy model, joint by joint; none of a model without rules.
+    """The rules of a neuro-fuzzy model, joint by joint; none for a model without rules.
 
-    Sets are named by their order and by where zero lies. Acceleration counts along the motion
+    Sets are named by their order and the position of zero. Acceleration is that along the motion
     (braking, speeding up) unless the model takes it signed.
 
     Args:
@@ -101,7 +101,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         joint_names: default joint1, joint2, ...
 
     Raises:
-        ValueError: if the names are not one a joint.
+        ValueError: if there is not one name per joint.
     """
     fuzzy = model.schedule.fuzzy_rules()
     if fuzzy is None:
@@ -114,13 +114,13 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         (speeds, speed_widths), (accelerations, widths) = (
             (c[j].tolist(), w[j].tolist()) for c, w in zip(fuzzy.centres, fuzzy.widths, strict=True)
         )
-        # Language has no words for more than five.
+        # There are no words for more than five.
         numbered = [f"speed {k + 1}" for k in range(len(speeds))]
         names_v = _in_order(speeds, _SPEEDS.get(len(speeds), numbered))
         names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
         v = tuple(map(Term, names_v, speeds, speed_widths))
         a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
-        # The order of the rule table: the acceleration varies faster.
+        # In the order of the rule table the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
         values = fuzzy.coefficients[j].tolist()
         rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
@@ -130,7 +130,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
 
 def _acceleration_names(ordered: Sequence[float], along_motion: bool) -> list[str]:
     below, above = ("braking", "speeding up") if along_motion else ("negative", "positive")
-    # The set nearest to zero: after training none need lie exactly there.
+    # The set nearest to zero, because after training none may lie exactly there.
     zero = min(range(len(ordered)), key=lambda k: abs(ordered[k]))
     return [
         *(_size(zero - k) + below for k in range(zero)),
@@ -151,13 +151,13 @@ def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
     return [named[k] for k in range(len(centres))]
 
 
-# In the order of the page: friction and errors first, then motions, then the models' insides.
+# In the order of the page: friction and errors first, then motions, then details of the models.
 _CAPTIONS = {
     "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
     "over the torque that the recorded motion implies, averaged over 30 ms, and its medians",
     "rmse_test": "Position error by model and joint, test recordings",
     "horizons_test": "Position error over the length of the simulation, test recordings; the band "
-    "is the limit of these data, the effect of noise of start and torque and of the integration",
+    "is the limit of these data, the effect of noise in start and torque and of the integration",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "mechanism": "The mechanism as the rig file describes it",
@@ -191,10 +191,10 @@ _JINJA.filters["sortable"] = lambda value: (
 
 
 def to_html(run: Run) -> str:
-    """A run as one HTML document without any reference to the outside.
+    """A run as one HTML document without external references.
 
-    Everything from the folder is escaped, and the page's own policy lets only its own script and
-    style run.
+    Everything from the folder is escaped, and the page's content policy allows only its own script
+    and style.
     """
     comparison = run.comparison
     error = {}
@@ -248,7 +248,7 @@ def write_report(folder: str | Path, path: str | Path) -> Run:
         OSError: if it cannot be read or the file cannot be written.
     """
     run = read_run(folder)
-    # A recording's name may come from a file name that is no valid UTF-8.
+    # A recording's name may come from a file name that is not valid UTF-8.
     write_atomically(path, to_html(run).encode(errors="backslashreplace"))
     return run
 
@@ -271,8 +271,8 @@ def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
 
 
 def _policy(style: str, script: str) -> str:
-    """Only this style and this script, and pictures that are in the page."""
-    # Hashes, as "unsafe-inline" would let injected code run.
+    """Content policy: only this style, this script, and pictures that are in the page."""
+    # Hashes, because "unsafe-inline" would let injected code run.
     of_style, of_script = (
         base64.b64encode(hashlib.sha256(t.encode()).digest()).decode() for t in (style, script)
     )
@@ -287,7 +287,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     fit, joints = run.fits[name], run.comparison.joint_names
     warnings = [*fit.warnings]
     for what, names in (("At a bound", fit.at_bounds), ("Not identifiable", fit.unidentifiable)):
-        # Most fits warn of them, and say more.
+        # The warnings of most fits already name them, with more detail.
         silent = [name for name in names if not any(name in warning for warning in fit.warnings)]
         if silent:
             warnings.append(f"{what}: {'; '.join(silent)}.")
@@ -301,7 +301,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for joint, value in zip(joints, values, strict=True)
     }
     intervals = [
-        # An open end is infinite, whichever it is.
+        # An open end is infinite at either side.
         (what, known.get(what, math.nan), low if math.isfinite(low) else -math.inf, high)
         for what, (low, high) in fit.intervals.items()
     ]
@@ -314,7 +314,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         "record": fit,
         "verdict": verdict,
         "why": why,
-        # Several fits of a chain may pass on the same warning.
+        # Fits that start from each other may pass on the same warning.
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,
     }
@@ -331,7 +331,7 @@ def _cards(run: Run) -> list[dict[str, Any]]:
         lines = []
         for name in next(iter(sets.values()), {}):
             values = [of[name][j] for of in sets.values() if name in of]
-            # A unit stays on the line of its number.
+            # A unit stays on the same line as its number.
             unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
@@ -350,7 +350,7 @@ def _cards(run: Run) -> list[dict[str, Any]]:
 
 
 def _units(run: Run, model: str) -> dict[str, str]:
-    """Unit of each coefficient, where the model's file is there."""
+    """Unit of each coefficient, if the model's file exists."""
     if model not in run.models:
         return {}
     return coefficient_units(run.models[model][0], run.comparison.unit)
@@ -384,7 +384,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
                 )
                 for term in terms
             )
-            head, columns = f"{name}, {of.joint}", ("word", "middle", "standard deviation", "unit")
+            head, columns = f"{name}, {of.joint}", ("word", "centre", "standard deviation", "unit")
             joints.append({
                 "rules": Table(
                     f"{head}: {len(rows)} rules",
@@ -401,7 +401,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def _recording_table(run: Run) -> Table:
-    """The free-run error of every model on every recording, beside the limit of these data."""
+    """The free-run error of every model on every recording, with the limit of these data."""
     rows: list[tuple[Value, ...]] = []
     for part in run.comparison.parts:
         for model, scores in run.comparison.scores(part).items():
@@ -412,7 +412,7 @@ def _recording_table(run: Run) -> Table:
                 rows.append((s.recording, model, part, 1e3 * s.free_run.all, limit, at, zero))
     unit = run.comparison.unit
     return Table(
-        "Every recording: free run over all joints",
+        "Free runs over all joints, by recording",
         ("recording", "model", "part", f"RMSE [m{unit}]", f"{LIMIT} [m{unit}]",
          "diverged", f"zero of the encoders [m{unit}]"),
         tuple(rows), "diverged",
@@ -429,7 +429,7 @@ def _data_table(run: Run) -> Table:
 
 
 def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | None:
-    """Trained range of velocity and acceleration; None where the file has none of that form."""
+    """Trained range of velocity and acceleration; None if the file has none in this form."""
     columns: list[str] = []
     ends: list[list[float]] = []
     for key, quantity, u in (("qd", "velocity", "s"), ("qdd", "acceleration", "s²")):

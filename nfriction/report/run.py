@@ -18,10 +18,10 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.files import is_intact, parse_json
 from nfriction.io.model_file import ModelFileError, ModelInfo, load, load_info
 
-# Far above any run of ours; larger files are none of it.
+# Far above the sizes in any run; larger files do not belong to one.
 LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
 _PNG, _GIF = b"\x89PNG\r\n\x1a\n", b"GIF8"
-# Text that `plots.save_all` puts before the picture.
+# Text that `plots.save_all` puts before the image data.
 _RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 
 Coefficients = dict[str, dict[str, tuple[float, ...]]]
@@ -33,7 +33,7 @@ class RunError(ValueError):
 
 @dataclass(frozen=True)
 class FitRecord:
-    """End of a fit, from `FitResult.to_dict`."""
+    """Outcome of a fit, from `FitResult.to_dict`."""
 
     status: str = "unknown"
     converged: bool = False
@@ -57,7 +57,7 @@ class FitRecord:
 
 @dataclass(frozen=True)
 class Figure:
-    """A PNG or GIF file with its size in pixels, and the id of its run if it bears one."""
+    """A PNG or GIF file with its size in pixels, and the id of its run if it contains one."""
 
     name: str
     data: bytes
@@ -74,15 +74,15 @@ class Run:
         id: of the run, in every file that it wrote.
         comparison: the scores, without simulated positions and without fits.
         fits: status of each fit, by model.
-        coefficients: by model, then by where they apply (`"always"` for a constant model),
-            then by name: a value a joint.
-        best: name of the best model, None where there was no test recording.
+        coefficients: by model, then by range of validity (`"always"` for a constant model),
+            then by name: one value per joint.
+        best: name of the best model, None if there was no test recording.
         indistinguishable: the best and all models tied with it, simplest first.
-        unfit: models not to be used, and why.
+        unfit: models not to be used, with the reason.
         recordings: digest by name of the `"train"` and `"test"` recordings.
         models: those whose files could be read, with the information in them.
-        notes: a sentence on everything that could not be read.
-        selection: the choice on the training recordings alone, where there is one.
+        notes: a sentence on each file that could not be read.
+        selection: the choice on the training recordings alone, if there is one.
     """
 
     id: str
@@ -105,11 +105,11 @@ class Run:
 def read_run(folder: str | Path) -> Run:
     """Read the folder of `nfriction compare` or `nfriction demo`.
 
-    Where a process was killed while it put its files in place, they are put there first.
+    If a process was killed while it put its files in place, that is completed first.
 
     Raises:
-        RunError: if the folder has no sound `results.json`, or files of two runs; one line says
-            what is wrong.
+        RunError: if the folder has no valid `results.json`, or files of two runs; one line states
+            the reason.
         OSError: if it cannot be read, or another process is writing it.
     """
     folder = Path(folder)
@@ -119,16 +119,16 @@ def read_run(folder: str | Path) -> Run:
     path = folder / "results.json"
     if not path.is_file():
         raise RunError(
-            f"{folder}: has no results.json; give a folder that `nfriction compare` or "
+            f"{folder} has no results.json; give a folder that `nfriction compare` or "
             "`nfriction demo` wrote."
         )
     # Before reading, so that a huge file cannot exhaust the memory.
     if path.stat().st_size > LARGEST_RESULTS:
-        raise RunError(f"{path}: is too large for results of a comparison.")
+        raise RunError(f"{path} is too large for results of a comparison.")
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
+        raise RunError(f"{path} is not JSON, or cut short ({error}).") from error
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise RunError(f"{path}: not results of schema {SCHEMA}; run the comparison again.")
     if not is_intact(content):
@@ -138,7 +138,7 @@ def read_run(folder: str | Path) -> Run:
         )
     try:
         run = _run(folder, content)
-    # Of what another program wrote, with a checksum that matches.
+    # From a file of another program with a matching checksum.
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RunError(f"{path}: not results of a comparison ({error!r:.200}).") from error
     _require_one_run(run)
@@ -226,7 +226,7 @@ def _coefficients(of: dict[str, Any]) -> Coefficients:
 def _models(
     folder: Path, fits: Mapping[str, FitRecord], joints: int
 ) -> tuple[dict[str, tuple[FrictionModel, ModelInfo]], list[str]]:
-    """Models whose files can be read; of our own names, so that no path is made of others."""
+    """Models whose files can be read; only known names, so that foreign names make no path."""
     found: dict[str, tuple[FrictionModel, ModelInfo]] = {}
     notes = []
     for name in (name for name in fits if name in model_names()):
@@ -245,12 +245,12 @@ def _models(
 
 
 def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
-    """Those in the order of their names, and a sentence on each that could not be read."""
+    """Figures in the order of their names, and a sentence on each that could not be read."""
     found: list[Figure] = []
     notes = []
     for path in sorted([*folder.glob("*.png"), *folder.glob("*.gif")])[:MOST_FIGURES]:
         if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
-            notes.append(f"figure {path.name}: no file, or too large")
+            notes.append(f"figure {path.name}: not a file, or too large")
             continue
         data = path.read_bytes()
         if not data.startswith((_PNG, _GIF)) or len(data) < 24:
@@ -266,7 +266,7 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
 
 
 def _require_one_run(run: Run) -> None:
-    """Refuse models and figures of another run than the results'."""
+    """Refuse models and figures from another run than the results."""
     foreign = [
         f"models/{name}.json"
         for name, (_, info) in run.models.items()
@@ -275,6 +275,6 @@ def _require_one_run(run: Run) -> None:
     foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
     if foreign:
         raise RunError(
-            f"{run.folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"{run.folder} has files of two runs: {', '.join(foreign)} belong to another run than "
             f"results.json; run the comparison again, or give a folder that a single run wrote."
         )

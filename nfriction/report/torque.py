@@ -60,8 +60,8 @@ def write_torque_fits(
 
     Args:
         fits: of a table.
-        folder: made where it does not exist; files of these names are replaced.
-        command: reproduces the results.
+        folder: made if it does not exist; files of these names are replaced.
+        command: command line that reproduces the results.
         figures: draw friction over velocity.
     """
     folder = Path(folder)
@@ -89,7 +89,7 @@ def write_torque_fits(
 
 
 def to_html(fits: TorqueFits, folder: Path, figures: list[Figure], command: str) -> str:
-    """The page of fits to a table as one HTML document without references to the outside."""
+    """The page of fits to a table as one HTML document without external references."""
     table, name = fits.table, next(iter(fits.chosen.values()))
     rows = tuple(
         (j.name, float(len(j)), "yes" if j.time is not None else "no", float(j.qd.min()),

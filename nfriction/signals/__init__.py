@@ -1,7 +1,7 @@
 """From encoder positions to motion: quantisation, causal velocity, smoothing.
 
-Velocity and acceleration come causally (`causal_motion`), as in a controller, by period counting
-and a second-order IIR filter, or for a fit from a smoother of the whole record (`kalman_smoother`).
+Velocity and acceleration are computed causally, as in a controller, by period counting and a
+second-order IIR filter (`causal_motion`), or by smoothing the whole record (`kalman_smoother`).
 
 Arrays are (time, joint); time is (time,) in seconds; positions are in radians (or metres).
 """

@@ -12,11 +12,11 @@ from nfriction.signals.kalman import Motion, check_motion
 
 Array = NDArray[np.float64]
 
-# Least share of one-count changes among all changes of a moving joint.
+# Smallest share of one-count changes among all changes of a moving joint.
 REPEATED = 0.01
-# Positions written with few digits make one count now larger, now smaller, by this share.
+# Positions written with few digits make the size of one count vary by this fraction.
 ALIKE = 0.05
-# Share of a joint's range: no encoder has so many counts, smaller changes are rounding.
+# Share of a joint's range: no encoder resolves as much, so smaller changes are round-off.
 ROUNDING = 1e-9
 
 
@@ -34,13 +34,13 @@ def quantise(q: ArrayLike, counts_per_revolution: float) -> Array:
 
 
 def count_seen(q: ArrayLike) -> Array:
-    """Estimate one count of each joint's encoder, (joint,), NaN where positions do not show it.
+    """Estimate one count of each joint's encoder, (joint,), NaN if positions do not show it.
 
-    It is the smallest change from a sample to the next if a hundredth of the changes equal it:
-    the smallest change of noise, or of numbers with many digits, hardly repeats.
+    It is the smallest change from one sample to the next if 1 % of the changes equal it: the
+    smallest change of noise, or of numbers with many digits, hardly recurs.
 
     Args:
-        q: positions as they were read [rad or m], shape (..., time, joint).
+        q: positions as read from the encoder [rad or m], shape (..., time, joint).
     """
     q = np.asarray(q, dtype=np.float64)
     changes = np.abs(np.diff(q, axis=-2)).reshape(-1, q.shape[-1])
@@ -58,8 +58,8 @@ def period_counting(time: ArrayLike, q: ArrayLike, counts_per_revolution: float)
 
     The velocity is the distance between the last two edges over the time between them. Without a
     further edge the joint cannot have moved by more than a count, so the speed falls as one count
-    over the time since the last edge. An edge crossed back and forth is no distance. Before the
-    second edge the velocity is zero.
+    over the time since the last edge. An edge crossed back and forth counts as no distance. Before
+    the second edge the velocity is zero.
 
     Args:
         time: sample times [s], shape (time,).
@@ -75,7 +75,7 @@ def period_counting(time: ArrayLike, q: ArrayLike, counts_per_revolution: float)
     for joint in range(q.shape[1]):
         step = np.diff(counts[:, joint])
         edges = np.flatnonzero(step) + 1
-        # One edge gives a place but no time to travel.
+        # One edge gives a position but no velocity.
         if len(edges) < 2:
             continue
         # An edge lies half a count before the new count, on the side it came from.
@@ -159,8 +159,8 @@ def causal_motion(
     """Motion from past and present samples alone, as in a controller.
 
     Velocity is period counting through the low-pass filter; acceleration is the difference of
-    that velocity through the same filter again. The filter runs at the median step even if the
-    stamps jitter, as a controller's does.
+    that velocity through the same filter again. The filter uses the median step even if the time
+    stamps jitter, as in a controller.
 
     Args:
         time: [s], shape (time,).
@@ -208,7 +208,7 @@ def frequency_counting(
         raise ValueError(f"`interval` must be positive [s], got {interval}.")
     quantum = _quantum(counts_per_revolution)
     counts = np.rint(q / quantum)
-    # Stamps are rounded: a sample that begins the interval exactly must not be missed.
+    # Time stamps are rounded, but a sample exactly at the start of the interval must count.
     begins = time - (1.0 - 1e-6) * interval
     first = np.maximum(np.searchsorted(time, begins, side="right") - 1, 0)
     elapsed = np.maximum(time - time[first], np.finfo(np.float64).tiny)

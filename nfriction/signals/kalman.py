@@ -1,4 +1,4 @@
-"""Smoothed motion: Rauch-Tung-Striebel smoother of a joint whose jerk changes by white noise alone.
+"""Smoothed motion: Rauch-Tung-Striebel smoother of a joint whose jerk is integrated white noise.
 
 Noise and bandwidth are estimated by maximum likelihood from the innovations of its Kalman filter.
 """
@@ -26,7 +26,7 @@ class Motion:
         q: position [rad], shape (time, joint).
         qd: velocity [rad/s], shape like `q`.
         qdd: acceleration [rad/s²], shape like `q`.
-        std: standard deviations of `q`, `qd` and `qdd` where the method knows them.
+        std: standard deviations of `q`, `qd` and `qdd` if the method provides them.
     """
 
     time: Array
@@ -61,10 +61,10 @@ def check_motion(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
 
 # State: position, velocity, acceleration, jerk.
 ORDER = 4
-# Time constants after which a state carries no information on the next: a longer gap between
-# samples counts as this long, for its own powers would leave nothing but rounding.
+# Time constants after which a state carries no information about the next. Longer gaps between
+# samples count as this long, because their powers would leave nothing but round-off.
 FARTHEST = 1000.0
-# Times the step; the likelihood of each is tried.
+# Candidate bandwidths times the step.
 BANDWIDTHS = np.geomspace(2e-3, 2.0, 19)
 _FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)])
 
@@ -80,7 +80,7 @@ def kalman_smoother(
     The jerk's rate is white noise, and so is the error of the positions. Parameters that are not
     given are estimated joint by joint: the ratio of the two noises by maximum likelihood, and with
     it the measurement noise, at least the quantisation error quantum/√12 of the encoder. Irregular
-    stamps are followed exactly.
+    time stamps are used exactly.
 
     Args:
         time: [s], shape (time,).
@@ -96,12 +96,12 @@ def kalman_smoother(
     """
     time, q = check_motion(time, q)
     step = float(np.median(np.diff(time)))
-    # Stamps that differ by rounding are taken as equal: steady gains are fast.
+    # Steps that differ only by rounding are taken as equal, because steady gains are fast.
     steps = np.full(len(time) - 1, step) if is_uniform(time) else np.diff(time)
     joints = q.shape[1]
     sigma = None if noise is None else _per_joint(noise, joints, "noise")
     density = None if jerk_density is None else _per_joint(jerk_density, joints, "jerk_density")
-    # Far from zero the position's digits would be lost in the smoother's products.
+    # Far from zero, digits of the position would be lost in the smoother's products.
     centred = q - q[0]
     if sigma is None or density is None:
         sigma, bandwidth = _most_likely(steps, centred, sigma, density)
@@ -128,24 +128,24 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     mean, covariance = _initial(spans, series)
     predicted, filtered, settled = _covariances(transition, diffusion, covariance)
     means = _filter(transition, predicted, mean, series)
-    # Smoother gain C = P F^T (F P F^T + Q)^-1, from its transpose as the predictions are symmetric.
+    # Smoother gain C = P F^T (F P F^T + Q)^-1, from its transpose: the predictions are symmetric.
     gain = np.linalg.solve(predicted[1:], transition @ filtered[:-1]).swapaxes(-1, -2)
     means[:-1] -= gain @ (transition @ means[:-1])
     for k in range(len(y) - 2, -1, -1):
         means[k] += gain[k] @ means[k + 1]
-    # A sum of squares, for a difference of covariances would lose its sign behind a long gap.
+    # A sum of squares, because a difference of covariances could become negative after a long gap.
     keep = np.eye(ORDER) - gain @ transition
     filtered[:-1] = keep @ filtered[:-1] @ keep.swapaxes(-1, -2)
     filtered[:-1] += gain @ diffusion @ gain.swapaxes(-1, -2)
     k = len(y) - 2
     while k >= 0:
         filtered[k] += gain[k] @ filtered[k + 1] @ gain[k].swapaxes(-1, -2)
-        # Far from both ends a uniform record has one covariance.
+        # Far from both ends the covariance of a uniform record is constant.
         if k > settled and _settled(filtered[k], filtered[k + 1]):
             filtered[settled:k] = filtered[k]
             k = settled
         k -= 1
-    # Behind a gap rounding may exceed a variance.
+    # After a gap round-off may exceed a variance.
     return means[..., 0], np.maximum(np.diagonal(filtered, axis1=-2, axis2=-1), 0.0)
 
 
@@ -154,18 +154,18 @@ def _most_likely(
 ) -> tuple[Array, Array]:
     """Measurement noise and the smoother's bandwidth [1/s] of every joint by maximum likelihood.
 
-    The bandwidth is (density / (sigma² step))^(1/8), the rate at which the smoother forgets. The
-    search is on a grid, with up to eight stretches of the record as independent series.
+    The bandwidth is (density / (sigma² step))^(1/8), the reciprocal of the smoother's memory. The
+    search is on a grid, with up to eight parts of the record as independent series.
     """
     step = float(np.median(steps))
-    # Stretches of 1000 samples determine two noise parameters well; more only cost time.
+    # Parts of 1000 samples determine two noise parameters well; more only cost time.
     length = min(len(q), 1000)
     first = np.linspace(0, len(q) - length, min(8, len(q) // length)).astype(int)
     stretches = first + np.arange(length)[:, None]
     delta = steps[stretches[:-1], None] / step * BANDWIDTHS
     y = q[stretches]
     if np.all(delta == BANDWIDTHS):
-        # Equal steps: all stretches share their covariances.
+        # With equal steps all parts share their covariances.
         delta, y = delta[:, :1], y.reshape(length, 1, -1)
     misfit, volume = _innovations(delta, y)
     misfit = misfit.reshape(len(BANDWIDTHS), -1, q.shape[1]).sum(axis=1)
@@ -205,7 +205,7 @@ def _innovations(delta: Array, y: Array) -> tuple[Array, Array]:
         predicted = _covariances(transition, diffusion, covariance)[0]
     means = _filter(transition, predicted, mean, series)
     ahead = (transition[..., :1, :] @ means[:-1])[..., 0, :]
-    # At least the noise's own, whatever rounding leaves of the prediction's behind a gap.
+    # At least that of the noise, even if round-off destroys the prediction's after a gap.
     variance = np.maximum(predicted[1:, ..., 0, 0], 0.0) + 1
     misfit = ((series[1:] - ahead) ** 2 / variance[..., None]).sum(axis=(0, 1))
     return misfit, np.log(variance).sum(axis=(0, 1))
@@ -231,7 +231,7 @@ def _lowest(cost: Array) -> Array:
 
 
 def _resolution(q: Array) -> Array:
-    """Smallest change of position between two samples of every joint, at least rounding error."""
+    """Smallest change of every joint's position between two samples, at least round-off."""
     change = np.abs(np.diff(q, axis=0))
     smallest = np.where(change > 0, change, np.inf).min(axis=0)
     rounding = np.finfo(np.float64).eps * np.maximum(np.abs(q).max(axis=0), 1.0)
@@ -260,7 +260,7 @@ def _model(delta: Array, process: Array) -> tuple[Array, Array]:
 def _initial(spans: Array, y: Array) -> tuple[Array, Array]:
     """Prior mean (..., order, series) and covariance of the first state, from a cubic at the start.
 
-    The covariance is a hundredfold of the fit's own: weak beside the record, yet well scaled.
+    The covariance is a hundred times that of the fit: weak relative to the data, but well scaled.
     """
     mean = np.empty((*y.shape[1:-1], ORDER, y.shape[-1]))
     covariance = np.empty((*spans.shape[1:], ORDER, ORDER))
@@ -268,8 +268,8 @@ def _initial(spans: Array, y: Array) -> tuple[Array, Array]:
         span = spans[(slice(None), *index)]
         # Within three time constants the model is close to a cubic.
         near = max(int(np.searchsorted(span, 3.0, side="right")), 2 * ORDER)
-        # A sample errs by its noise and by the motion's departure from the cubic, which dominates
-        # behind a gap.
+        # The error of a sample is its noise plus the motion's deviation from the cubic, which
+        # dominates after a gap.
         weight = 1 / np.sqrt(1 + _model(span[:near], np.ones(1))[1][..., 0, 0])
         basis = span[:near, None] ** np.arange(ORDER) / _FACTORIAL
         inverse = np.linalg.pinv(basis * weight[:, None])

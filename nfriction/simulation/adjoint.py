@@ -1,9 +1,9 @@
 """Gradients of rollouts by the discrete adjoint: a reverse sweep over the Jacobians of all steps.
 
 Recording every operation of every step costs far more than the arithmetic. Here the motion is
-simulated without a graph, compiled where that is possible. All states are known then, so that the
-Jacobians of many steps come from one batch. The sweep takes one small matrix product per step, and
-one vector-Jacobian product per batch gives the gradient by the torque and the modules' tensors.
+simulated without a graph, compiled if possible. Then all states are known, so that the Jacobians of
+many steps come from one batch. The sweep takes one small matrix product per step, and one
+vector-Jacobian product per batch gives the gradient in the torque and the modules' tensors.
 
 References:
     The discrete adjoint of a Runge-Kutta method: E. Hairer, C. Lubich and G. Wanner, Geometric
@@ -22,18 +22,19 @@ from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import acceleration, runge_kutta
 
-# Samples linearised together, by device: enough that the calls cost little, few enough for the
-# cache or (at some 20 KB each) the memory.
+# Samples linearised together, by device: enough that calls cost little, few enough for the cache or
+# (at about 20 KB each) the memory.
 CHUNK = {"cpu": 2**13, "cuda": 2**18}
 
-# Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
+# Beyond this many steps gradients are rarely intended and may take gigabytes, so they must be
+# requested.
 MOST_STEPS = 10_000
 
 States = tuple[Tensor, ...]
 
 
 def wants_gradients(inputs: RolloutInputs, tensors: Iterable[Tensor]) -> bool:
-    """True where an input of a rollout or one of its modules' tensors requires a gradient."""
+    """True if an input of a rollout or one of its modules' tensors requires a gradient."""
     given = (inputs.q0, inputs.qd0, inputs.tau, *tensors)
     short = inputs.step.shape[-1] <= MOST_STEPS
     return short and torch.is_grad_enabled() and any(x.requires_grad for x in given)
@@ -42,10 +43,10 @@ def wants_gradients(inputs: RolloutInputs, tensors: Iterable[Tensor]) -> bool:
 def adjoint_rollout(
     simulate: Callable[[], States], plant: Plant, friction: Friction, inputs: RolloutInputs
 ) -> States | None:
-    """States that `simulate` computes, differentiable once by initial state, torque and modules.
+    """States from `simulate`, differentiable once in initial state, torque and modules.
 
-    None where a gradient would be incomplete: with a hidden state, a law with memory, a sample
-    time or measured motion that requires one, or modules that read tensors of others.
+    None if a gradient would be incomplete: with a hidden state, a law with memory, a sample time or
+    measured motion that requires one, or modules that read tensors of others.
     """
     modules = [m for m in (plant, friction) if isinstance(m, nn.Module)]
     own = (t for m in modules for t in (*m.parameters(), *m.buffers()) if t.requires_grad)
@@ -62,14 +63,14 @@ def adjoint_rollout(
 
 
 def _is_closed(system: "_System") -> bool:
-    """True where gradients of a step reach no other tensors, found by walking its graph."""
+    """True if gradients of a step reach no other tensors, found by walking its graph."""
     q, qd = system.inputs.q0.detach(), system.inputs.qd0.detach()
     tau = system.inputs.tau[..., 0, :].detach().expand_as(q)
     with torch.enable_grad():
         held = system.friction.coefficients(qd, tau)  # the graph does not depend on the values
         found = held, acceleration(system.plant, system.friction, q, qd, tau, held)
     known = {id(t) for t in system.tensors}
-    # A buffer may itself have been computed: there the walk ends, and autograd goes on.
+    # A buffer may itself have been computed: the walk ends there, and autograd continues.
     seen = {t.grad_fn for t in system.tensors}
     nodes = [y.grad_fn for y in found if y.grad_fn is not None]
     while nodes:
@@ -114,7 +115,7 @@ class _Rollout(torch.autograd.Function):
 
 
 class _Sweep:
-    """One reverse sweep over states (q, qd, qdd); gradients gather in `by_tau` and `by_tensor`."""
+    """A reverse sweep over states (q, qd, qdd); `by_tau` and `by_tensor` collect gradients."""
 
     def __init__(self, system: _System, batch: torch.Size) -> None:
         def series(x: Tensor) -> Tensor:
@@ -129,8 +130,8 @@ class _Sweep:
         self.by_tensor = [torch.zeros_like(t) for t in self.tensors]
 
     def run(self, states: Tensor, cotangents: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients by q and qd at the start; arguments are (steps + 1, *batch, 3 joint)."""
-        # A step that diverges passes nothing back, but its numbers would turn zeros into NaN.
+        """Gradients in q and qd at the start; arguments are (steps + 1, *batch, 3 joint)."""
+        # A divergent step passes nothing back, but its numbers would turn zeros into NaN.
         alive = torch.isfinite(states[1:]).all(-1, keepdim=True)
         before = torch.where(alive, states[:-1], 0.0)
         carried = cotangents[-1]
@@ -155,7 +156,7 @@ class _Sweep:
             total += more
 
     def _chunk(self, part: slice, states: Tensor, cotangents: Tensor, carried: Tensor) -> Tensor:
-        """Carry the cotangent of the state after these samples to that before them."""
+        """Propagate the cotangent of the state after these samples to that before them."""
         tau = self.tau[part].detach().requires_grad_()
         pieces = []
         for _ in range(self.substeps):
@@ -173,7 +174,7 @@ class _Sweep:
 
     @torch.enable_grad()
     def _linearised(self, part: slice, states: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
-        """States after each step with their graph, and their Jacobians by the states before."""
+        """States after each step with their graph, and their Jacobians in the states before."""
         q, qd, qdd = states.chunk(3, -1)
         joints, h = q.shape[-1], self.step[part]
         driven = [x[part] for x in self.measured] or [
@@ -209,7 +210,7 @@ class _Sweep:
     def _stage_jacobians(
         self, stages: Sequence[tuple[Tensor, Tensor]], tau: Tensor, held: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Jacobians of the stages' accelerations by (q, qd) and by all coefficients."""
+        """Jacobians of the stages' accelerations in (q, qd) and in all coefficients."""
         q, qd = (torch.stack(x).requires_grad_() for x in zip(*stages, strict=True))
         c = held.expand(4, *held.shape).contiguous().requires_grad_()
         rates = acceleration(self.plant, self.friction, q, qd, tau, c)
@@ -218,7 +219,7 @@ class _Sweep:
         return by_state, torch.stack([row[2].flatten(-2) for row in rows], -2)
 
     def _drive_jacobian(self, held: Tensor, driven: Sequence[Tensor]) -> Tensor:
-        """Jacobian of the coefficients by motion, (step, *batch, joint coefficient, 2 joint)."""
+        """Jacobian of coefficients in the motion, (step, *batch, joint coefficient, 2 joint)."""
         if getattr(self.friction, "joint_wise", False):
             # Each joint's coefficients follow its own motion: one pass is enough for all.
             rows = [_pulled(c, driven, retain=True) for c in held.unbind(-1)]
@@ -231,7 +232,7 @@ class _Sweep:
 def _pulled(
     output: Tensor, inputs: Sequence[Tensor], cotangent: Tensor | None = None, retain: bool = False
 ) -> list[Tensor]:
-    """Vector-Jacobian products, of ones by default; zero where the output does not depend."""
+    """Vector-Jacobian products, with ones by default; zero for inputs that do not matter."""
     if not output.requires_grad or not inputs:
         return [torch.zeros_like(x) for x in inputs]
     pull = torch.ones_like(output) if cotangent is None else cotangent

@@ -1,7 +1,7 @@
-"""Closed loops: a plant with friction under a controller that reads encoders once a sample.
+"""Closed loops: a plant with friction under a controller that reads encoders once per sample.
 
-Between samples the motion is that of `rollout` with the torque held, so one motion of a closed loop
-equals the rollout of its recorded torques.
+Between samples the motion is that of `rollout` with the torque held, so a closed-loop motion equals
+the rollout with its recorded torques.
 """
 
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 
 
 class Feedback(Protocol):
-    """Controller as seen by a closed loop; it may keep a state of its own from call to call."""
+    """Controller in a closed loop; it may keep a state from call to call."""
 
     def __call__(self, time: float, q: Array) -> Array:
-        """Torque wanted [N m] for the positions that the encoders read, both (*batch, joint)."""
+        """Commanded torque [N m] for the positions that the encoders read, both (*batch, joint)."""
         ...
 
 
@@ -48,11 +48,11 @@ class Electronics:
 
     Attributes:
         sample_time: between two calls of the controller [s].
-        counts: of the encoders a revolution, after quadrature; None for exact positions.
-        delay: samples from reading the encoders to the torque that follows from it.
+        counts: of the encoders per revolution, after quadrature; None for exact positions.
+        delay: samples from reading the encoders to the resulting torque.
         torque_limit: largest |torque| of the drives [N m].
         torque_bits: of the digital-to-analogue converter over that range; None for exact torques.
-        substeps: integration steps to a sample.
+        substeps: integration steps per sample.
 
     Raises:
         ValueError: if a number is out of its range, or a converter has no torque limit.
@@ -81,14 +81,14 @@ class Electronics:
             )
 
     def read(self, q: Array) -> Array:
-        """Positions that the encoders give [rad]."""
+        """Positions read by the encoders [rad]."""
         if self.counts is None:
             return q
         quantum = 2.0 * np.pi / self.counts
         return quantum * np.rint(q / quantum)
 
     def drive(self, torque: Array) -> Array:
-        """Torque that the drives exert when asked for `torque` [N m]."""
+        """Torque that the drives exert for a command `torque` [N m]."""
         held = np.clip(torque, -self.torque_limit, self.torque_limit)
         if self.torque_bits is None:
             return held
@@ -102,7 +102,7 @@ class ControlledMotion(Rollout):
 
     Attributes:
         tau: torque over each step [N m], (*batch, steps, joint).
-        measured: positions that the encoders gave for it [rad], same shape.
+        measured: encoder positions from which it was computed [rad], same shape.
     """
 
     tau: Tensor
@@ -123,17 +123,17 @@ def control(
 ) -> ControlledMotion:
     """Simulate a plant with friction under a controller.
 
-    A batch of states is one batch for the controller, so that several settings run at once.
+    A batch of states is also a batch for the controller, so that several settings run at once.
 
     Args:
         plant, friction: the mechanism and its friction; None for no friction.
-        controller: called once a sample, in order, with time and encoder positions.
+        controller: called once per sample, in order, with time and encoder positions.
         q0, qd0: initial state [rad, rad/s] in joint coordinates, (*batch, joint).
         steps: samples after the first.
         electronics: sample time, encoders, delay and drives.
 
     Returns:
-        The motion; NaN from where it diverged, as of `rollout`.
+        The motion; NaN after it diverged, as from `rollout`.
 
     Raises:
         ValueError: if inputs do not fit, friction is too steep at rest for a stable integration, or
@@ -157,7 +157,7 @@ def control(
     diverged_at = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
     for k in range(steps):
         reading = electronics.read(q.numpy())
-        # Encoders are read before the torque of the sample acts; torques in flight act first.
+        # Encoders are read before the torque of the sample acts; delayed torques act first.
         waiting.append(electronics.drive(_wanted(controller, k * sample_time, reading)))
         tau = torch.as_tensor(waiting.pop(0)).clone()
         if stateful is not None:
@@ -172,10 +172,10 @@ def control(
         q, qd, _, *law = after
         torques.append(tau)
         readings.append(torch.as_tensor(reading).clone())
-        # A motion that is lost must not reach the controllers of the others.
+        # A diverged motion must not affect the controllers of the others.
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         if bool(lost.any()):
-            # The sample after this one, as of a rollout.
+            # The sample after this one, as in a rollout.
             diverged_at[lost] = diverged_at[lost].clamp_max((k + 1) * sample_time)
             q = torch.where(lost[..., None], given.q0, q)
             qd = torch.where(lost[..., None], torch.zeros_like(qd), qd)
@@ -191,11 +191,11 @@ def control(
 
 
 def _wanted(controller: Feedback, time: float, reading: Array) -> Array:
-    """Torque that the controller wants."""
+    """Torque that the controller commands."""
     wanted = np.asarray(controller(time, reading), dtype=np.float64)
     if wanted.shape != reading.shape or not np.isfinite(wanted).all():
         raise ValueError(
-            f"the controller must give finite torques {reading.shape}, got shape "
+            f"the controller must return finite torques {reading.shape}, got shape "
             f"{wanted.shape} at {time:g} s."
         )
     return wanted

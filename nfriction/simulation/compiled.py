@@ -1,8 +1,8 @@
-"""Compiled rollouts, found by all that plant and friction read and kept for later calls.
+"""Compiled rollouts, cached by everything that plant and friction read.
 
-Code is compiled once for all plants and friction models that compute the same: parameters and
-buffers are inputs of the compiled code, so a fit may change them between calls. Constants are part
-of the code, whether an attribute, a global or a closure holds them; a change of one is noticed.
+Code is compiled once for all plants and friction models with the same computation: parameters and
+buffers are inputs of the compiled code, so a fit may change them between calls. Constants, whether
+in an attribute, a global or a closure, are part of the code; a change of one is detected.
 """
 
 import logging
@@ -22,11 +22,11 @@ from nfriction.simulation.rk4 import rk4_step
 logger = logging.getLogger(__name__)
 
 Backend = Literal["auto", "compiled", "torch"]
-# Compiled structures kept in memory; each is some hundred kilobytes.
+# Compiled structures kept in memory, a few hundred kilobytes each.
 KEPT = 32
 
-# By the fingerprint of plant and friction, cheap enough for every call, and by what is computed: a
-# changed fingerprint takes a new trace, and only another graph another compilation.
+# By the fingerprint of plant and friction, cheap enough for every call, and by the graph: a changed
+# fingerprint needs a new trace, but only a changed graph needs another compilation.
 _known: OrderedDict[Hashable, "codegen.CompiledRollout | codegen.CodegenError"] = OrderedDict()
 _compiled_graphs: OrderedDict[Hashable, "codegen.CompiledRollout"] = OrderedDict()
 _warned: set[str] = set()
@@ -34,16 +34,16 @@ _warned: set[str] = set()
 
 @dataclass(frozen=True)
 class System:
-    """Plant and friction, with a fingerprint by which a later change is noticed."""
+    """Plant and friction, with a fingerprint that reveals a later change."""
 
     plant: Any
     friction: Any
     tensors: Mapping[str, Tensor]  # floating-point ones, by "plant." or "friction." and name
-    fingerprint: Hashable  # of all else that they read; the error that says why there is none
+    fingerprint: Hashable  # of all else that they read, or the error that prevents one
 
     @classmethod
     def of(cls, plant: Any, friction: Any) -> "System":
-        """The two as they are now."""
+        """The two in their present state."""
         modules = {"plant": plant, "friction": friction}
         modules = {name: m for name, m in modules.items() if isinstance(m, nn.Module)}
         tensors = {
@@ -60,7 +60,7 @@ class System:
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
-    """Return true if compiled code should be tried."""
+    """True if compiled code should be tried."""
     if backend not in get_args(Backend):
         raise ValueError(f"`backend` must be one of {get_args(Backend)}, got {backend!r}.")
     able = not gradients and q.dtype == torch.float64 and q.device.type == "cpu"
@@ -82,8 +82,8 @@ def integrate_compiled(
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
-    None where `backend="auto"` finds no way to compile, so that eager torch has to do it. The
-    friction model's parameters that differ from its own come by name, (*batch, *its shape).
+    None if compilation fails with `backend="auto"`, so that eager torch has to be used. Parameters
+    of the friction model that replace its own are given by name, (*batch, *its shape).
     """
     compiled = _compiled(system, backend, step_function)
     if compiled is None:
@@ -100,7 +100,7 @@ def _compiled(
     backend: Backend,
     step_function: StepFunction = rk4_step,
 ) -> "codegen.CompiledRollout | None":
-    """The compiled rollout of this system, from the cache where it is there."""
+    """The compiled rollout of this system, from the cache if it is there."""
     plant, friction = system.plant, system.friction
     if backend == "torch":
         return None
@@ -113,7 +113,7 @@ def _compiled(
         )
     if isinstance(system.fingerprint, codegen.Incomparable):
         _warn_once(
-            "compiled rollouts are traced anew in every call, because they may read "
+            "compiled rollouts are traced again in every call, because they may read "
             f"{system.fingerprint}"
         )
         found = _attempt(plant, friction, step_function)
@@ -142,14 +142,14 @@ def _attempt(
     except codegen.SelfCheckFailed:
         raise
     except codegen.CodegenError as error:
-        _warn_once(f"rollouts run in eager torch, as they cannot be compiled: {error}")
+        _warn_once(f"rollouts run in eager torch, because they cannot be compiled: {error}")
         return error.with_traceback(None)
     _keep(_compiled_graphs, found.digest, found)
     return found
 
 
 def _keep(cache: OrderedDict[Hashable, Any], key: Hashable, value: Any) -> None:
-    """Remember the most recent ones."""
+    """Keep the most recent entries."""
     cache[key] = value
     cache.move_to_end(key)
     if len(cache) > KEPT:
@@ -163,7 +163,7 @@ def _warn_once(message: str) -> None:
 
 
 def _check_compilable(plant: Any, friction: Any) -> None:
-    """Refuse modules that compiled code would take for others than they are."""
+    """Refuse modules that compiled code would misinterpret."""
     for module in (plant, friction):
         for name, value in (*module.named_parameters(), *module.named_buffers()):
             if value.is_floating_point() and value.dtype != torch.float64:

@@ -1,8 +1,8 @@
 """One step of a mechanism whose friction has memory: friction implicit, the mechanism by RK4.
 
 A contact in presliding is a spring, often so stiff that an explicit step of a millisecond is
-unstable. Here the friction torque is held over a step and solved for: it is what the law gives
-after the step, at the velocity that this very torque leads to. With the fraction theta of the step
+unstable. Here the friction torque is held over a step and solved for: it is that of the law after
+the step, at the velocity to which this torque leads. With the fraction theta of the step
 
     v = qd + theta h (qdd_0 - W tau_f),    tau_f = torque(z + theta (z' - z), v),
     z' = advance(z, v, h),
@@ -29,8 +29,8 @@ from torch import Tensor
 from nfriction.simulation.protocols import Friction, Plant
 from nfriction.simulation.rk4 import runge_kutta
 
-# Guesses of the velocity after the first. More of them change a motion by less than the step's own
-# error; torque and state belong to one velocity after any number of them.
+# Iterations of the velocity after the first guess. More of them change a motion by less than the
+# step's own error; torque and state belong to one velocity after any number of them.
 ITERATIONS = 2
 # Velocity [rad/s] at which the slope at rest is measured: below that of any Stribeck curve.
 SLOW = 1e-9
@@ -70,7 +70,7 @@ def memory_step(
     """One step with coefficients, torque and friction held.
 
     Args:
-        plant, ..., step: as of `rk4_step`; the friction's law has memory.
+        plant, ..., step: as for `rk4_step`; the friction's law has memory.
         state: of the law at the start, (*batch, joint, state).
 
     Returns:
@@ -78,15 +78,15 @@ def memory_step(
     """
     law = memory_of(friction)
     assert law is not None
-    # Held like the torque: a load that changes within a step is of the step's own order.
+    # Held like the torque: the error is of the order of the step's own.
     zero = torch.zeros_like(qd)
     load = tau + zero if law.transmitted else plant.load(q, qd)
     mobility = [list(row) for row in zip(*unit_responses(plant, q, zero), strict=True)]
     at_ease = torch.zeros_like(state)
     moved = law.advance(at_ease, zero + SLOW, load, coefficients, step)
-    # A constant offset of the torque is no part of the slope.
+    # A constant offset of the torque is not part of the slope.
     offset = law.torque(at_ease, zero, load, coefficients)
-    # Friction that falls over the first displacement is taken as flat: it would not stabilise.
+    # Friction that falls over the first displacement counts as flat: it would not stabilise.
     steepest = ((law.torque(moved, zero + SLOW, load, coefficients) - offset) / SLOW).clamp(min=0.0)
     stiffness = step * torch.stack([row[j] for j, row in enumerate(mobility)], -1) * steepest
     theta = (1.0 + stiffness) / (2.0 + stiffness)
@@ -109,7 +109,7 @@ def memory_step(
         v = _solve(mobility, reach.unbind(-1), slope.unbind(-1), list(free.unbind(-1)))
         found, after = friction_at(v)
 
-    # By the same torque in all stages, so that what the mechanism loses is what the law took.
+    # With the same torque in all stages, so that the mechanism loses the energy that the law takes.
     def rate(q: Tensor, qd: Tensor) -> Tensor:
         return plant.forward_dynamics(q, qd, tau - found)
 

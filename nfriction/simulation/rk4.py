@@ -5,8 +5,8 @@ A step integrates
     qdd = M(q)^-1 (tau - tau_f - bias(q, qd)),    tau_f = f(qd, load(q, qd), c),
 
 which the plant solves for qdd (`forward_dynamics`), with the coefficients c of the friction law f
-and the torque tau held over the step. Near rest friction is steep, of a slope F_c / v_smooth; that
-limits the length of a step. The next step is `nfriction.simulation.rollout`, which checks the
+and the torque tau held over the step. Near rest friction is steep, with a slope F_c / v_smooth,
+which limits the length of a step. The next step is `nfriction.simulation.rollout`, which checks the
 inputs and chooses between these steps and compiled ones.
 """
 
@@ -22,7 +22,7 @@ from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, StepF
 def acceleration(
     plant: Plant, friction: Friction, q: Tensor, qd: Tensor, tau: Tensor, coefficients: Tensor
 ) -> Tensor:
-    """Joint acceleration under given coefficients of friction [rad/s^2], (*batch, joint)."""
+    """Joint acceleration for given coefficients of friction [rad/s^2], (*batch, joint)."""
     tau_f = friction.torque(qd, plant.load(q, qd), coefficients)
     return plant.forward_dynamics(q, qd, tau - tau_f)
 
@@ -81,7 +81,7 @@ def simulate_eager(
     """
     q, qd, tau = inputs.q0, inputs.qd0, inputs.tau
     step = inputs.step / inputs.substeps
-    # Nothing is known of friction before the first step, so this acceleration leaves it out.
+    # Before the first step friction is unknown, so this acceleration omits it.
     qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
     internal = [] if inputs.law_state is None else [inputs.law_state]
     states = [(q, qd, qdd, *internal)]
@@ -112,7 +112,7 @@ def simulate_eager(
         torch.stack([x.expand(*shape, *x.shape[dims:]) for x in one], dims - 1)
         for one in zip(*states, strict=True)
     )
-    # NaN from where a motion is lost to the end, as compiled code writes it.
+    # NaN from the divergence of a motion to its end, as in compiled code.
     fine = (torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1, keepdim=True)
     lost = ~fine.cumprod(-2).bool()
     internal = [x.masked_fill(lost[..., None], torch.nan) for x in internal]

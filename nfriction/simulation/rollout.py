@@ -1,9 +1,9 @@
 """Rollouts: the motion of a plant with friction by classical Runge-Kutta steps.
 
-Coefficients that depend on the motion are held over a step, as a controller at the sample rate
-would hold them; that also breaks the loop in which friction needs the acceleration and the
-acceleration needs friction. The next step is `nfriction.fitting.fit`: the coefficients with which
-such a simulation follows a recording.
+Coefficients that depend on the motion are held over a step, as in a controller at the sample rate;
+this also breaks the algebraic loop in which friction depends on the acceleration and the
+acceleration on friction. The next step is `nfriction.fitting.fit`: the coefficients with which such
+a simulation follows a recording.
 """
 
 from dataclasses import replace
@@ -71,9 +71,9 @@ def rollout(
             tensors here they may be arrays, which keep their precision, or lists, read as float64.
         tau: joint torque [N m] held over each step, (steps, joint) or (*batch, steps, joint).
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
-        steps: number of samples after the first; optional where `tau` or `sample_time` gives it.
-        substeps: integration steps to each sample. A hidden state advances once a sample; other
-            coefficients are evaluated anew at each of these steps.
+        steps: number of samples after the first; optional if `tau` or `sample_time` implies it.
+        substeps: integration steps per sample. A hidden state advances once per sample; other
+            coefficients are evaluated at each of these steps.
         scheme: `"rk4"` integrates friction as a smooth function of velocity, so that joints creep
             where they ought to rest. `"time_stepping"` takes semi-implicit steps of first order
             in which dry friction stops a joint and holds it, however steep; it needs shorter
@@ -83,17 +83,17 @@ def rollout(
         hidden_state: of the coefficients after the first sample (see `Schedule.states`), (*batch,
             joint, state_size), to continue an earlier motion; by default that of the sample alone.
         law_state: internal state of a friction law with memory at the start, (*batch, joint,
-            state), to continue an earlier motion; by default nothing is deflected.
-        gradients: make the motion differentiable; by default where any input requires it, `backend`
-            is not `"compiled"`, and there are at most 10,000 steps.
+            state), to continue an earlier motion; by default undeflected.
+        gradients: make the motion differentiable; by default if any input requires it, `backend` is
+            not `"compiled"`, and there are at most 10,000 steps.
         backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition (no
-            gradients); `"auto"` compiles where it can. Its gradients come from an adjoint sweep, of
+            gradients); `"auto"` compiles if possible. Its gradients come from an adjoint sweep, of
             first order only; for higher ones, or in `torch.func`, `"torch"` records every step.
         threads: number of threads that share a compiled batch.
 
     Returns:
-        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A motion that diverges is no
-        error: it is NaN from `diverged_at` on.
+        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). Divergence is not an error:
+        the motion is NaN from `diverged_at` on.
 
     Raises:
         ValueError: if shapes do not fit, inputs are not finite, friction is too steep at rest for
@@ -119,7 +119,7 @@ def rollout(
 
 
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
-    """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
+    """`rollout` without checks and gradients, for searches whose trials may be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = with_states(inputs, model, inputs.hidden_state, inputs.law_state)
     return Rollout.of(inputs, simulate(System.of(plant, model), inputs))
@@ -132,7 +132,7 @@ def simulate(
     backend: Backend = "auto",
     threads: int = 1,
 ) -> tuple[Tensor, ...]:
-    """States q, qd, qdd, each (*batch, steps + 1, joint), by the backend that can compute them."""
+    """States q, qd, qdd, each (*batch, steps + 1, joint), from the backend that supports them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
     step_function: StepFunction = rk4_step if memory_of(system.friction) is None else memory_step
     states = None

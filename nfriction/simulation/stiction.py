@@ -1,6 +1,6 @@
 """Time-stepping with dry friction that truly sticks: joints stop instead of creeping.
 
-A smoothed sign lets a joint that ought to rest creep at a share of its smoothing velocity. Here
+A smoothed sign lets a joint that ought to rest creep at a fraction of its smoothing velocity. Here
 friction is an impulse that at most stops its joint within the step; the torque that holds a joint
 below breakaway is solved for, not modelled.
 """
@@ -15,7 +15,7 @@ from nfriction.simulation.memory_step import memory_of, unit_responses
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import simulate_eager
 
-# In units of the smoothing velocity: from there on a joint slides, with the law's friction.
+# Velocity, in units of the smoothing velocity, above which a joint slides with the law's friction.
 SLIDING = 5.0
 # Gauss-Seidel sweeps over the joints' impulses; a single joint takes one.
 SWEEPS = 20
@@ -32,10 +32,10 @@ def moreau_step(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One semi-implicit Euler step with friction that stops a joint, then holds it.
 
-    The impulse of friction brings each joint to rest, limited to what the law gives while it
-    slides. With several joints impulses are found in turns (projected Gauss-Seidel).
+    The impulse of friction brings each joint to rest, limited to that of the law in sliding. With
+    several joints, impulses are found in turn (projected Gauss-Seidel).
 
-    Arguments are those of `rk4_step`; the results q and qd at the end, and the mean qdd.
+    Arguments are those of `rk4_step`; the results are q and qd at the end, and the mean qdd.
 
     References:
         M. Duclusaud et al., Extended friction models for the physics simulation of servo
@@ -75,8 +75,8 @@ def simulate_stiction(
     given = gradients or inputs.measured is not None or inputs.hidden_state is not None
     if memory_of(friction) is not None:
         raise ValueError(
-            "a friction law with memory holds a joint by itself, so `time_stepping` has no use for "
-            'it; use scheme="rk4".'
+            "a friction law with memory holds a joint by itself, so it needs no `time_stepping`; "
+            'use scheme="rk4".'
         )
     if given or isinstance(friction, NoFriction) or as_stateful(friction) is not None:
         raise ValueError(

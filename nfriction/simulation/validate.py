@@ -24,15 +24,16 @@ R = TypeVar("R")
 
 # RK4 is stable on the negative real axis down to h * lambda = -2.785.
 RK4_STABILITY = 2.785
-# Some tens of kilobytes each.
+# Number of cached rates, a few tens of kilobytes each.
 KEPT_RATES = 64
 _decay_rates: dict[Hashable, float] = {}
 
 
 def outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
-    """The function without gradients in `torch.inference_mode()`, which is left meanwhile.
+    """The function, without gradients and outside `torch.inference_mode()` if that is active.
 
-    Its tensors can be neither traced nor differentiated, and the slope at rest is a derivative.
+    Inference tensors can be neither traced nor differentiated, but the slope at rest is a
+    derivative.
     """
 
     @wraps(function)
@@ -46,7 +47,7 @@ def outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def all_finite(x: Tensor) -> bool:
-    """True where no element is NaN or infinite, in one pass over them."""
+    """True if no element is NaN or infinite, in one pass over them."""
     if not x.numel():
         return True
     low, high = x.detach().aminmax()  # NaN if there is one
@@ -54,7 +55,7 @@ def all_finite(x: Tensor) -> bool:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64."""
+    """A tensor unchanged; arrays keep their precision, whole numbers and lists become float64."""
     if isinstance(value, Tensor):
         found = value
     else:
@@ -121,7 +122,7 @@ def validate_inputs(
         shape = (*np.broadcast_shapes(*batches.values()), joints)
     except ValueError:
         shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
-        raise ValueError(f"batches must be the same, 1 or left out, got {shown}.") from None
+        raise ValueError(f"batches must be the same, 1 or omitted, got {shown}.") from None
     return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
 
 
@@ -159,7 +160,7 @@ def validate_measured(
     for x in found:
         if x.shape[-2:] != shape or not all_finite(x):
             raise ValueError(
-                f"`measured` must be two finite (*batch, {shape[0]}, {shape[1]}), a value a step, "
+                f"`measured` must be two finite (*batch, {shape[0]}, {shape[1]}), one per step, "
                 f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
             )
     return found[0], found[1]
@@ -174,13 +175,9 @@ def with_states(
     """The inputs with the states from which coefficients and a law with memory continue."""
     law, size = memory_of(friction), getattr(friction, "state_size", 0)
     if hidden_state is not None and size == 0:
-        raise ValueError(
-            "`hidden_state` is for friction whose coefficients have one; leave it out."
-        )
+        raise ValueError("`hidden_state` is for friction whose coefficients have one; omit it.")
     if law_state is not None and law is None:
-        raise ValueError(
-            "`law_state` is for a friction law with memory, such as LuGre; leave it out."
-        )
+        raise ValueError("`law_state` is for a friction law with memory, such as LuGre; omit it.")
     if law is not None and law_state is None:
         law_state = inputs.q0.new_zeros(inputs.q0.shape[-1], law.size)
     sizes = {"hidden_state": size, "law_state": 0 if law is None else law.size}
@@ -204,9 +201,9 @@ def with_states(
 
 
 def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> int:
-    """Integration steps per sample that keep friction stable where it is steepest, at rest.
+    """Integration steps per sample that keep friction stable at rest, where it is steepest.
 
-    Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. Its fastest mode decays at
+    Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. The fastest mode decays at
     the largest eigenvalue lambda of M^-1 D, over all poses, so h lambda must stay below 2.785.
     """
     rate = plant.decay_rate(friction.zero_velocity_damping())
@@ -221,7 +218,7 @@ def require_stability(system: System, inputs: RolloutInputs) -> None:
     sample_time = float(inputs.step.max())
     longest_step = sample_time / inputs.substeps
     excess = _fastest_decay(system) * longest_step / RK4_STABILITY
-    # As much slack as `required_substeps` takes, so that its number is never refused.
+    # The same tolerance as in `required_substeps`, so that its number is never refused.
     if not excess * (1 - 1e-9) > 1:  # false of NaN
         return
     rows = friction.zero_velocity_damping().reshape(-1, plant.joints)
@@ -233,15 +230,15 @@ def require_stability(system: System, inputs: RolloutInputs) -> None:
         f"{joint + 1} with a slope of {float(rows[:, joint].max()):.3g} N m s/rad: it damps "
         f"{excess:.3g} times as fast as RK4 can integrate. "
         f"Use substeps={required_substeps(plant, friction, sample_time)} or "
-        # A twentieth more outweighs the rounding to two digits.
+        # 5 % more outweighs the rounding to two digits.
         f"v_smooth >= {1.05 * v_smooth * excess:.2g} (now {v_smooth:g})."
     )
 
 
 def _fastest_decay(system: System) -> float:
-    """Decay rate of the fastest mode at rest [1/s], kept for the same system with the same values.
+    """Decay rate of the fastest mode at rest [1/s], cached for the same system and values.
 
-    A derivative and eigenvalues take as long as simulating some thousand steps.
+    A derivative and eigenvalues take as long as simulating a few thousand steps.
     """
     if isinstance(system.fingerprint, codegen.Incomparable):
         return float(system.plant.decay_rate(system.friction.zero_velocity_damping()).max())
@@ -255,7 +252,7 @@ def _fastest_decay(system: System) -> float:
 
 
 def warn_of_sample_time(friction: Friction, inputs: RolloutInputs) -> None:
-    """Warn of a hidden state that decays at another rate than the model was made for."""
+    """Warn if a hidden state decays at another rate than the model was made for."""
     meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
     step = float(inputs.step.mean()) if meant is not None else 0.0
     if meant is not None and not 0.5 < step / meant < 2.0:

@@ -288,7 +288,7 @@ def test_a_model_that_cannot_be_fitted_is_told_beside_the_others(
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["demo", "--seconds", "1", "--models", "NCFM", "--out", str(tmp_path), "--no-figures"]
     assert cli.main(words) == 0
-    assert "2 to test on" in capsys.readouterr().out
+    assert "2 for testing" in capsys.readouterr().out
     assert list(results(tmp_path)["models"]) == ["no friction", "NCFM"]
 
 

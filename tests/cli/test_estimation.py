@@ -238,7 +238,7 @@ def test_a_law_of_ones_own_goes_all_the_way(
         ("my.py:STICKI", "has no law STICKI; its laws: STICKY"),
         ("my.py:OTHER", "has no law OTHER"),
         ("my.py:TAKEN", "CVFM is one of the library"),
-        ("absent.py:STICKY", "absent.py is not there"),
+        ("absent.py:STICKY", "absent.py does not exist"),
         ("broken.py:STICKY", "broken.py cannot be run: NameError"),
     ],
 )

@@ -163,14 +163,14 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
     ("words", "message"),
     [
         (["--format", "basic"], "cannot export to 'basic'; there are torchscript, c, pt2"),
-        (["--format", ","], "takes some of"),
+        (["--format", ","], "needs some of"),
         (["--format", "mjcf"], "--recording"),
         (["--torque-limit", "-1"], "positive numbers"),
         (["--torque-limit", "1,2"], "torque_limit"),
-        (["--cutoff", "1,2"], "takes one number"),
+        (["--cutoff", "1,2"], "must be one number"),
         (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
         (["--online", "0.1"], "--online needs c in"),
-        (["--online", "0.1,0.2", "--format", "c"], "--online: takes one number"),
+        (["--online", "0.1,0.2", "--format", "c"], "--online: must be one number"),
     ],
 )
 def test_what_cannot_be_done_is_said(

@@ -52,9 +52,9 @@ def test_errors_are_one_line_with_the_remedy(
     assert "column qd is missing; found speed, tau" in line
     assert '--columns "qd=speed"' in line
     assert main(["score-torque", str(tmp_path), str(csv)]) == 2
-    assert "no folder that fit-torque wrote" in capsys.readouterr().err
+    assert "no folder written by fit-torque" in capsys.readouterr().err
     assert main(["score-torque", str(tmp_path / "none"), str(csv)]) == 2
-    assert "is not there" in capsys.readouterr().err
+    assert "does not exist" in capsys.readouterr().err
     words = ["--columns", "qd=speed", "--folds", "1"]
     assert main(["fit-torque", str(csv), *words]) == 2
     assert "--folds must be at least 2" in capsys.readouterr().err

@@ -138,7 +138,7 @@ def test_names_must_tell_recordings_apart():
 
 def test_a_recording_is_not_judged_by_under_another_name_either():
     for name in ("a", "copy"):
-        with pytest.raises(ValueError, match=rf"{name}: both trained on and tested on; .*not seen"):
+        with pytest.raises(ValueError, match=rf"{name}: used for training and testing; .*not seen"):
             compare(pendulum(), ["NCFM"], [A], [B, dataclasses.replace(A, name=name)])
 
 

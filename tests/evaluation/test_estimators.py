@@ -175,7 +175,7 @@ def test_misuse_is_told(recordings: list[Recording]) -> None:
     for wrong in (recordings[0].q, [recordings[0].q], 5):
         with pytest.raises(TypeError, match="a recording is a Recording, the path"):
             FrictionEstimator(pendulum()).fit(wrong)
-    with pytest.raises(ValueError, match="recordings are needed"):
+    with pytest.raises(ValueError, match="a recording or a list of recordings is needed"):
         FrictionEstimator(pendulum()).fit([])
     with pytest.raises(FileNotFoundError, match=r"a\.csv"):
         FrictionEstimator(pendulum()).fit("a.csv")

@@ -190,10 +190,10 @@ def test_models_that_a_table_cannot_show_are_refused_with_the_reason() -> None:
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no folder that fit-torque wrote"):
+    with pytest.raises(ValueError, match="no folder written by fit-torque"):
         read_models(tmp_path)
     (tmp_path / "results.json").write_text('{"chosen": 3}')
-    with pytest.raises(ValueError, match="no folder that fit-torque wrote"):
+    with pytest.raises(ValueError, match="no folder written by fit-torque"):
         read_models(tmp_path)
 
 

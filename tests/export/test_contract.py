@@ -178,10 +178,10 @@ VECTORS = contract().to_dict()["vectors"]
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no JSON"),
+        ("", "not JSON"),
         (contract().to_json()[:-50], "cut short"),
         ("[]", "not those of a controller"),
-        ("[" * 100_000, "no JSON|not those"),
+        ("[" * 100_000, "not JSON|not those"),
         (edited(format="other"), "not those of a controller"),
         (edited(schema=99), "schema is '99', not 1"),
         (edited(vectors=None), "missing or damaged"),

@@ -91,7 +91,9 @@ def test_metadata_cannot_loosen_the_tolerance(
 
 
 def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
-    with pytest.raises(ExportError, match=r"It is of another model: model LFM instead of NLFM\."):
+    with pytest.raises(
+        ExportError, match=r"It belongs to another model: model LFM instead of NLFM\."
+    ):
         verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 
 
@@ -147,12 +149,12 @@ def test_what_is_no_artefact_is_refused(
     bad = tmp_path / f"bad{kind}"
     for content in (b"", b"junk", artefacts[kind].read_bytes()[:1000]):
         bad.write_bytes(content)
-        with pytest.raises(ExportError, match=rf"bad{kind}: no artefact of nfriction"):
+        with pytest.raises(ExportError, match=rf"bad{kind} is no artefact of nfriction"):
             verify_artefact(bad, MODEL, INFO)
     files = files_of(artefacts[kind])
     with zipfile.ZipFile(packed(bad, files), "a") as archive:
         archive.writestr(f"archive/{[*files][-1].upper()}", b"other")
-    with pytest.raises(ExportError, match=rf"bad{kind}: holds .* twice"):
+    with pytest.raises(ExportError, match=rf"bad{kind} contains .* twice"):
         verify_artefact(bad, MODEL, INFO)
     packed(bad, files | {f"extra/{METADATA}": b"{}"})
     with pytest.raises(ContractError):

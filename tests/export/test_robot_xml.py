@@ -36,7 +36,7 @@ def test_joints_are_found_by_name_and_the_rest_stays(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no XML"),
+        ("", "not XML"),
         (URDF[:-20], "cut short"),
         ("<mujoco/>", "not <robot>"),
         ('<!DOCTYPE r [<!ENTITY x "y">]><robot>&x;</robot>', "which is refused"),

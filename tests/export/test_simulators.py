@@ -88,7 +88,7 @@ def test_load_and_memory_go_in() -> None:
 
 def test_a_motion_that_says_nothing_is_refused() -> None:
     still = Motion(TIME, *(np.zeros((len(TIME), 2)) for _ in range(3)))
-    with pytest.raises(ValueError, match="stands still"):
+    with pytest.raises(ValueError, match="does not move"):
         fit_damping_frictionloss(LFM(2), still)
     with pytest.raises(ValueError, match="the law 'dahl' has: export a model without"):
         fit_damping_frictionloss(Dahl(2), still)

@@ -195,9 +195,9 @@ def without_annotations(qd, load, coefficients, v_smooth):
     ("function", "message"),
     [
         (lambda qd, load, coefficients, v_smooth: coefficients.select(-1, 0) * qd, "the law 'odd "),
-        (through_numpy, "the law 'odd one' does not script.*numpy"),
-        (any_number, "the law 'odd one' does not script.*variable number of arguments"),
-        (without_annotations, "the law 'odd one' does not script.*v_smooth"),
+        (through_numpy, "the law 'odd one' cannot be scripted.*numpy"),
+        (any_number, "the law 'odd one' cannot be scripted.*variable number of arguments"),
+        (without_annotations, "the law 'odd one' cannot be scripted.*v_smooth"),
     ],
     ids=["lambda", "numpy", "any number", "without annotations"],
 )

@@ -428,7 +428,7 @@ def test_a_recording_of_another_rig_is_named():
         for name, x in files.items()
     ]
     found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
-    assert found == ("other is of another rig, or recorded in another way, than the others",)
+    assert found == ("other is from another rig than the others, or was recorded differently",)
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
 
 
@@ -439,7 +439,7 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
     assert task.per_recording
     assert not task.mistakes
     shared = prepare_task(CVFM(2), plant, recordings, FitOptions(encoder_reference="shared"))
-    assert "of another rig" in shared.mistakes[0]
+    assert "from another rig" in shared.mistakes[0]
 
 
 @pytest.mark.parametrize("rounded", [True, False])

@@ -319,14 +319,14 @@ def test_what_does_not_match_is_refused():
     other = swing(pendulum(), true_model(), seconds=0.5, convention="absolute,hanging", name="o")
     for arguments, message in (
         ((LFM(2), pendulum(), []), "at least one recording"),
-        ((LFM(3), pendulum(), recording), "as many joints"),
-        ((LFM(2), LinearAxis(1.0), recording), "as many joints"),
+        ((LFM(3), pendulum(), recording), "equally many joints"),
+        ((LFM(2), LinearAxis(1.0), recording), "equally many joints"),
         ((LFM(2), pendulum(), [recording, other]), "convention"),
         ((LFM(2), pendulum(), replace(recording, unit="m")), "swing is in m, .* in rad"),
         ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
         (
             (LFM(2), pendulum(), [other, recording, replace(other, name="copy")]),
-            "3 .copy.; leave one",
+            "3 .copy. contain the same data; leave one",
         ),
     ):
         with pytest.raises(ValueError, match=message):
@@ -362,7 +362,7 @@ def test_motions_must_be_those_of_the_recordings(model):
                   for s, n in ((0.5, "one"), (0.6, "other")))  # fmt: skip
     motion = kalman_smoother(one.time, one.q)
     for recordings, motions in (([one, other], [motion]), ([other], [motion])):
-        with pytest.raises(ValueError, match=r"`motions` must be one of each recording.*got 1 of"):
+        with pytest.raises(ValueError, match=r"`motions` must match the recordings.*got 1 of"):
             fit(model(2), pendulum(), recordings, motions=motions)
 
 
@@ -626,5 +626,5 @@ def test_what_ends_at_zero_is_told_as_none_of_it():
     recording = swing(pendulum(), truth, seconds=3.0)
     found = fit(LFM(2, v_smooth=0.05), pendulum(), recording, windows=(0.5,), max_steps=10)
     assert {"B of joint1", "drag quadratic"} <= set(found.at_bounds)
-    assert f"At zero: {', '.join(found.at_bounds)}; the data show none." in found.warnings
+    assert f"At zero: {', '.join(found.at_bounds)}; the data show no such effect." in found.warnings
     assert not any("beyond" in w for w in found.warnings)

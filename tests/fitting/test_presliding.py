@@ -179,7 +179,7 @@ def geared():
 def test_a_gears_loss_needs_the_drives_torque(geared) -> None:
     recording, found = geared
     undriven = recording._replace(tau=None, name="swing")
-    told = "in swing, and gear reads the drive's torque; add tau or take dahl"
+    told = "in swing, and gear reads the drive's torque; add tau or use dahl"
     with pytest.raises(ValueError, match=told):
         fit("gear", AXIS, undriven, method="equation_error")
     with pytest.raises(ValueError, match=told):

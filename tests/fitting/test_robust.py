@@ -118,7 +118,7 @@ def test_spikes_hardly_change_a_robust_fit_and_are_named(loss):
     assert {(o.recording, o.joint) for o in spikes} == {("axis", "joint1")}
     at = recording.time[SPIKES].tolist()
     assert {(o.first, o.last) for o in spikes} == {(at[0], at[1]), (at[2], at[2]), (at[3], at[3])}
-    assert any("counts samples less than half" in w for w in found.warnings)
+    assert any("gives less than half weight" in w for w in found.warnings)
     assert found.to_dict()["outliers"][0]["recording"] == "axis"
     # Residuals are as measured; their root mean square counts as the loss does.
     assert float(found.residuals.abs().max()) > 0.02
@@ -139,4 +139,4 @@ def test_spikes_of_the_torque_hardly_change_a_robust_regression(loss):
     assert abs(deviation(found) - deviation(best)) < 0.2 * abs(deviation(squares) - deviation(best))
     for time in recording.time[SPIKES]:
         assert any(o.first <= time <= o.last and o.weight < 0.1 for o in found.outliers)
-    assert any("counts samples less than half" in w for w in found.warnings)
+    assert any("gives less than half weight" in w for w in found.warnings)

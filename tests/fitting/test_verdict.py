@@ -179,7 +179,7 @@ def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
     (model_error,) = model_error_warning(3e-3, 3e-4, 3e-4, "rad")
     assert "3 mrad RMS, 10x the measurement noise" in model_error
     none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
-    assert none == "At zero: B, C; the data show none."
+    assert none == "At zero: B, C; the data show no such effect."
     assert beyond == "At a bound: v_s; the data favour values beyond it."
     (lost,) = warnings_of(
         **good | {"at_bounds": ["B"], "unidentifiable": ["B of joint1"]}, at_zero=["B"]

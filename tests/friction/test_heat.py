@@ -150,7 +150,7 @@ def test_a_model_file_keeps_the_heat(tmp_path) -> None:
 def test_a_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
     model = warming_network()
     model.schedule.log_heat_capacity.fill_(-800.0)
-    with pytest.raises(ModelFileError, match="no finite torque"):
+    with pytest.raises(ModelFileError, match="a torque that is not finite"):
         load(save(model, tmp_path / "m.json"))
 
 

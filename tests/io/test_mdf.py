@@ -52,7 +52,7 @@ def test_channels_are_read_by_name_with_their_units(
     without_worker()
     with pytest.raises(ValueError, match="given as 'rad', but the file says 'deg'"):
         Recording.read(path, columns={"q1": "enc_1:rad"})
-    with pytest.raises(ValueError, match="'bar' is no unit of q"):
+    with pytest.raises(ValueError, match="'bar' is not a unit of q"):
         Recording.read(path, columns={"q1": "gas"})
     with pytest.raises(ValueError, match="columns time, q1 are missing; found enc_1, enc_2, gas"):
         Recording.read(path)
@@ -72,7 +72,7 @@ def test_channels_of_arrays_are_refused() -> None:
     """Damaged files have such, where none can be written."""
     arrays = SimpleNamespace(samples=Q, timestamps=TIME, unit="rad")
     file = SimpleNamespace(channels_db={"q1": ((0, 1),)}, get=lambda _: arrays)
-    with pytest.raises(ValueError, match="channel q1 holds arrays"):
+    with pytest.raises(ValueError, match="channel q1 has arrays"):
         measurements.choose_channels(file, ())
 
 

@@ -291,7 +291,7 @@ def test_layout_is_no_damage(tmp_path: Path) -> None:
         (b"\xff\xfe\x00", "not a model file, or cut short"),
         (b"[]", "not a model file of nfriction"),
         (b'{"format": "other"}', "not a model file of nfriction"),
-        (b'{"format": "nfriction model", "schema": 99}', "schema 99 is not 1"),
+        (b'{"format": "nfriction model", "schema": 99}', "its schema is 99, not 1"),
         (b'{"format": "nfriction model", "schema": 1}', "`model` is missing"),
         (
             b'{"format": "nfriction model", "schema": 1, "model": NaN}',
@@ -318,7 +318,7 @@ def test_absent_files_folders_and_giants_are_refused(tmp_path: Path) -> None:
     giant = tmp_path / "giant.json"
     with giant.open("wb") as file:
         file.truncate(2**40)
-    with pytest.raises(ModelFileError, match="too many for a model file"):
+    with pytest.raises(ModelFileError, match="too large for a model file"):
         load(giant)
 
 
@@ -327,7 +327,7 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "true for one": (lambda c: c.update(joints=True), "`joints` is missing or of the wrong type"),
     "no state": (lambda c: c.pop("state"), "`state` is missing"),
     "no info": (lambda c: c.pop("rig"), "`rig` is missing"),
-    "unknown model": (lambda c: c.update(model="LFN"), "'LFN' is none of the named models"),
+    "unknown model": (lambda c: c.update(model="LFN"), "'LFN' is not one of the named models"),
     "unknown option": (lambda c: c["options"].update(depth=3), "depth"),
     "many joints": (lambda c: c.update(joints=10**9), "sizes .* is refused"),
     "no joints": (lambda c: c.update(joints=0), "sizes .* is refused"),
@@ -342,17 +342,17 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
         lambda c: c["state"].update({"schedule.raw": [[1.0, float("inf")], [1.0, 1.0]]}),
         "numbers must be finite",
     ),
-    "ragged": (lambda c: c["state"].update({"schedule.raw": [[1.0], [1.0, 2.0]]}), "no array"),
-    "text": (lambda c: c["state"].update({"schedule.raw": "abc"}), "no array of numbers"),
-    "null": (lambda c: c["state"].update({"schedule.raw": None}), "no array of numbers"),
-    "object": (lambda c: c["state"].update({"schedule.raw": {"a": 1}}), "no array of numbers"),
+    "ragged": (lambda c: c["state"].update({"schedule.raw": [[1.0], [1.0, 2.0]]}), "not an array"),
+    "text": (lambda c: c["state"].update({"schedule.raw": "abc"}), "not an array of numbers"),
+    "null": (lambda c: c["state"].update({"schedule.raw": None}), "not an array of numbers"),
+    "object": (lambda c: c["state"].update({"schedule.raw": {"a": 1}}), "not an array of numbers"),
     "huge integer": (
         lambda c: c["state"].update({"schedule.raw": [[10**400, 1], [1, 1]]}),
         "numbers must be finite, got 1000",
     ),
     "true for a number": (
         lambda c: c["state"].update({"schedule.raw": [[True, 1.0], [1.0, 1.0]]}),
-        "no array of numbers",
+        "not an array of numbers",
     ),
     "no sample time": (lambda c: c.update(sample_time=0), "`sample_time` must be positive"),
     "true for a sample time": (lambda c: c.update(sample_time=True), "of the wrong type"),
@@ -368,9 +368,15 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "names no texts": (lambda c: c.update(joint_names=["a", 2]), "must be texts"),
     "too few names": (lambda c: c.update(joint_names=["a"]), "must be 2 texts"),
     "digest no text": (lambda c: c["training_data"].update(run=1), "map names to digests"),
-    "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "no array|got shape"),
-    "extra": (lambda c: c["state"].update(other=[1.0]), "missing or not the model's: .*other"),
-    "absent": (lambda c: c["state"].pop("schedule.raw"), "missing or not the model's: .*raw"),
+    "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "not an array|got shape"),
+    "extra": (
+        lambda c: c["state"].update(other=[1.0]),
+        "missing or do not belong to the model: .*other",
+    ),
+    "absent": (
+        lambda c: c["state"].pop("schedule.raw"),
+        "missing or do not belong to the model: .*raw",
+    ),
     "law": (lambda c: c.update(law="viscous"), "`law` is 'viscous' in the file, 'linear' in"),
     "coefficients": (lambda c: c.update(coefficients=[1, 2]), "`coefficients` is"),
 }

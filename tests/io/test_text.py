@@ -130,7 +130,7 @@ def test_only_whole_lines_are_comments(tmp_path: Path, separator: str) -> None:
 
 def test_degrees_said_of_the_whole_file_are_converted_when_asked(tmp_path: Path) -> None:
     text = "# unit: deg\n" + written(",", False)
-    with pytest.raises(ValueError, match="got 'deg'; degrees are converted by"):
+    with pytest.raises(ValueError, match=r"got 'deg'; .*converts degrees"):
         read(tmp_path, text)
     back = read(tmp_path, text, degrees=True)
     assert back.unit == "rad"
@@ -151,10 +151,10 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time;q1;q2\n0,1;1,5;1.5\n0,2;1,6;1.6\n", "decimal commas and column q2 decimal points"),
         ("time;q1\n0,1;1,5\n0,2;1.6\n", "must be a number, got '1,5'|decimal commas"),
         ("time;q1\n0;1.23,5\n1;1.235,5\n", r"column q1, row 0 .* got '1\.23,5'"),
-        ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 is there more than once"),
-        ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 is there more than once"),
-        ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is no unit of q"),
-        ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is no unit of q"),
+        ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 occurs more than once"),
+        ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 occurs more than once"),
+        ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is not a unit of q"),
+        ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is not a unit of q"),
         ("time;q1\nx;y\n0;1\n", "row 0 .* must be a number, got 'x'"),
         ("# only: a comment\n", "no header"),
         ("time;q1\n0;\0\n", "NUL bytes"),
@@ -213,7 +213,7 @@ def test_counts_are_whole(tmp_path: Path, separator: str, recwarn: pytest.Warnin
 def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separator: str) -> None:
     text = log([thousands(int(x), separator) for x in COUNTS])
     with pytest.warns(
-        RecordingWarning, match=r"q1 .*3[56].*assumed is that it is a decimal sign; .*# decimal"
+        RecordingWarning, match=r"q1 .*assumed that .*3[56].* is a decimal sign; .*# decimal"
     ):
         assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], COUNTS / 1000)
     for decimal, scale in ((separator, 1000), ({",": ".", ".": ","}[separator], 1)):
@@ -227,7 +227,7 @@ def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separ
 def test_a_motion_through_a_thousand_is_followed_and_said(tmp_path: Path, separator: str) -> None:
     counts = COUNTS - 34_900
     text = log([thousands(int(x), separator) for x in counts])
-    with pytest.warns(RecordingWarning, match="assumed is that it separates thousands"):
+    with pytest.warns(RecordingWarning, match=r"assumed that .* separates thousands"):
         assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], counts)
 
 
@@ -278,8 +278,8 @@ def test_signs_that_contradict_are_refused(tmp_path: Path, text: str, message: s
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"q1": "enc:grad"}, "enc:grad is missing.* 'grad' is no unit known"),
-        ({"q1": "enc:ms"}, "column enc: 'ms' is no unit of q"),
+        ({"q1": "enc:grad"}, "enc:grad is missing.* 'grad' is not a known unit"),
+        ({"q1": "enc:ms"}, "column enc: 'ms' is not a unit of q"),
         ({"q1": "absent:deg"}, "absent:deg is missing; found time, enc"),
         ({"q1": "enc:rad", "time": "time [ms]:s"}, "is missing"),
         ({"joint": "enc"}, "`columns` maps time, q1"),
@@ -307,7 +307,7 @@ def test_a_german_row_of_units_is_read_and_own_words_give_way(tmp_path: Path) ->
     np.testing.assert_allclose(found.time[:2], [0, 1e-3])
     np.testing.assert_allclose(np.rad2deg(found.q[1, 0]), 10.5)
     np.testing.assert_allclose(found.q[8, 1], 8e-3)
-    with pytest.raises(ValueError, match="'Striche' is no unit of q"):
+    with pytest.raises(ValueError, match="'Striche' is not a unit of q"):
         read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns | {"q2": "Arm"})
 
 
@@ -317,7 +317,7 @@ def test_what_unpacks_to_far_more_is_refused(
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(b"time,q1\n" + b"0,0\n" * 100_000))
     monkeypatch.setattr("nfriction.io.formats.LARGEST", 100_000)
-    with pytest.raises(ValueError, match="unpacked bytes, more than 100000 are read"):
+    with pytest.raises(ValueError, match="unpacked bytes, more than the limit of 100000"):
         Recording.read(path)
 
 

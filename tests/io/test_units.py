@@ -48,7 +48,7 @@ def test_milliseconds_are_exact() -> None:
      ("q", "counts/0"), ("q", "counts/"), ("q", "gon"), ("q", "")],
 )  # fmt: skip
 def test_a_unit_of_another_kind_is_refused(kind: str, unit: str) -> None:
-    with pytest.raises(ValueError, match=f"is no unit of {kind}; known are"):
+    with pytest.raises(ValueError, match=f"is not a unit of {kind}; known units are"):
         to_si(kind, np.ones(2), unit)
 
 

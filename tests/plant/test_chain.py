@@ -240,7 +240,7 @@ def test_replace_leaves_the_original_alone_and_refuses_strangers() -> None:
         rig.replace(inertia_coupling=torch.ones(3))
     with pytest.raises(TypeError, match="tensor"):
         rig.replace(armature=[1.0, 1, 1])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="fixed arm only"):
+    with pytest.raises(ValueError, match="only for a fixed arm"):
         rigs.tlrip("free").replace(drag_linear=torch.ones(3))
 
 
@@ -330,7 +330,7 @@ def test_chain_formula_of_the_multiarm_bench() -> None:
         ({"com": [0.5, 0.0]}, "positive definite"),
         ({"inertia": [1.0, 1.0, 1.0]}, "`inertia` must be None"),
         ({"inertia": [0.0, -0.5]}, "positive definite"),
-        ({"gravity": 0.0}, "`gravity` must be at least 1e-06"),
+        ({"gravity": 0.0}, "`gravity` must be at least 1e-06.*write 1e-06 .*rotor"),
         ({"gravity": 5e-324}, "`gravity` must be at least 1e-06"),
         ({"armature": [0.0, -1.0]}, "`armature` must not be negative"),
         ({"convention": ("absolute", "down")}, "`convention` must be"),

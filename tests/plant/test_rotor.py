@@ -113,10 +113,10 @@ def test_motors_of_several_links_are_no_absolute_angles() -> None:
     def arm(*convention: str) -> PendulumChain:
         return PendulumChain([1.0, 0.5], [0.3, 0.2], motor=Motor(10.0), convention=convention)
 
-    with pytest.raises(ValueError, match="relative to the link before"):
+    with pytest.raises(ValueError, match="relative to the previous link"):
         Recording.from_pandas(table, plant=arm("absolute", "hanging"))
     plant = arm("relative", "hanging")
-    with pytest.raises(ValueError, match="relative to the link before"):
+    with pytest.raises(ValueError, match="relative to the previous link"):
         Recording.from_pandas(table, plant=plant, convention="absolute,hanging")
     q = Recording.from_pandas(table, plant=plant).q
     np.testing.assert_allclose(q, np.stack([np.sin(time), 2 * np.sin(time)], 1))

@@ -135,7 +135,7 @@ def test_a_motion_shows_the_joints_asked_for_within_the_measured_range():
         assert max(np.abs(ax.get_ylim())) < 1
     assert_tidy(figure)
     assert_tidy(recording.plot())
-    with pytest.raises(ValueError, match="this very recording"):
+    with pytest.raises(ValueError, match="the same recording"):
         plots.motion(swing(2), scores)
 
 
@@ -151,7 +151,7 @@ def test_an_error_that_diverged_does_not_set_the_scale():
 
 
 def test_positions_of_another_recording_are_refused():
-    with pytest.raises(ValueError, match="this very recording"):
+    with pytest.raises(ValueError, match="the same recording"):
         plots.positions(swing(2), scores_of(swing(1)))
     with pytest.raises(ValueError, match="empty"):
         plots.positions(swing(1), {})

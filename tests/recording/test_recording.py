@@ -181,7 +181,9 @@ def test_a_unit_shows_what_drives_a_joint(tmp_path: Path, unit: str, kind: str) 
 def test_a_column_is_named_once(columns: dict[str, str]) -> None:
     table = swing().to_pandas().drop(columns="tau2", errors="ignore")
     columns = {"q1": "q1", "q2": "q2"} | columns
-    with pytest.raises(ValueError, match=r"names column q\d for q\d and .*; each has a column"):
+    with pytest.raises(
+        ValueError, match=r"names column q\d for q\d and .*; each needs its own column"
+    ):
         Recording.from_pandas(table, columns=columns)
 
 
@@ -250,7 +252,7 @@ def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
 
 def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", time=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="none of numbers or text"):
+    with pytest.raises(ValueError, match="neither numbers nor text"):
         Recording.read(tmp_path / "run.npz")
 
 
@@ -318,7 +320,7 @@ def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
         assert np.array_equal(found.q[:, 0], q)
     assert list(numbered.columns) == [0, 1]
     repeated = pd.DataFrame(np.stack([time, q, q], axis=1), columns=["time", "q1", "q1"])
-    with pytest.raises(ValueError, match="column q1 is there more than once"):
+    with pytest.raises(ValueError, match="column q1 occurs more than once"):
         Recording.from_pandas(repeated)
 
 
@@ -437,7 +439,7 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
     assert len(again) == 60
     assert recording[pd.Series(keep)].digest() == part.digest()
     for wrong in (keep[:50], np.arange(10), True):
-        with pytest.raises(TypeError, match=r"100 times True or False, got .* of shape"):
+        with pytest.raises(TypeError, match=r"mask of 100 booleans, got .* of shape"):
             recording[wrong]
 
 
@@ -646,7 +648,9 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
     path.write_text("id,q0_1,qd0_1\n")
-    with pytest.raises(ValueError, match="has no rows; write one with id, q0_1, qd0_1"):
+    with pytest.raises(
+        ValueError, match="has no rows; write one per recording with id, q0_1, qd0_1"
+    ):
         read_initial_states(path)
     path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
     assert list(read_initial_states(path)) == ["a"]
@@ -723,11 +727,11 @@ def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
 
 
 def test_a_motor_unknown_to_the_rig_is_named() -> None:
-    with pytest.raises(ValueError, match=r"motor1 is of a motor.*`gear_ratio`.*plant=rig"):
+    with pytest.raises(ValueError, match=r"motor1 belongs to a motor.*`gear_ratio`.*plant=rig"):
         Recording.from_pandas(motor_log(motor1=1.0))
     table = motor_log(q1=0.1)
     rig = Rotor(0.02, motor=Motor(50))
-    with pytest.raises(ValueError, match=r"current1 is of a motor.*`torque_constant`"):
+    with pytest.raises(ValueError, match=r"current1 belongs to a motor.*`torque_constant`"):
         Recording.from_pandas(table, columns={"current1": "I"}, plant=rig)
     # A column that happens to be there is no reason to stop.
     with pytest.warns(RecordingWarning, match="looks like motor current"):
@@ -738,7 +742,7 @@ def test_a_motor_unknown_to_the_rig_is_named() -> None:
 @pytest.mark.parametrize("size", [1.0, 20.0])
 def test_positions_in_whole_degrees_or_counts_are_refused(size):
     q, time = np.rint(np.linspace(0, 360 * size, 50))[:, None], np.arange(50) / 100
-    with pytest.raises(ValueError, match=r"radians, got whole numbers alone, from 0 to .*counts"):
+    with pytest.raises(ValueError, match=r"radians, got only whole numbers, from 0 to .*counts"):
         Recording(time, q)
     assert Recording(time, q, unit="m").unit == "m"
     assert Recording(time, np.ones_like(q)).joints == 1

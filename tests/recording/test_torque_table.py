@@ -71,7 +71,7 @@ def test_velocity_comes_from_positions_in_time() -> None:
         (table(tau=["x"] * 20), "column tau, row 0 .* must be a number"),
         (table(time=QD[::-1]), "time of joint1 must increase"),
         (table().iloc[:5], "joint1 has 5 rows; at least 8"),
-        (table(torque=QD), "both are tau; rename one"),
+        (table(torque=QD), "are both tau; rename one"),
         (table(joint=1, qd2=QD, tau2=QD), "drop the column joint"),
         (table(joint=[1.0] * 19 + [np.nan]), "column joint, row 19 .* names no joint"),
     ],

@@ -328,7 +328,7 @@ def test_a_memory_made_for_other_samples_is_warned_of(caplog):
 
 
 def test_a_memory_must_fit_the_model():
-    with pytest.raises(ValueError, match="leave it out"):
+    with pytest.raises(ValueError, match="omit it"):
         run(smooth_model(), steps=2, hidden_state=torch.zeros(2, 2))
     for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
         with pytest.raises(ValueError, match="hidden_state"):
@@ -546,7 +546,7 @@ def test_inference_mode_changes_nothing(backend, scheme):
         ({"steps": 5, "drive": "measured"}, "measured"),
         ({"steps": 5, "drive": "mesured"}, "measured"),
         ({"steps": 5, "measured": (torch.zeros(5, 2),) * 2}, "measured"),
-        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(6, 2),) * 2}, "a step"),
+        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(6, 2),) * 2}, "one per step"),
         ({"steps": 5, "drive": "measured", "measured": (torch.full((5, 2), torch.nan),) * 2},
          "finite"),
         ({"steps": 5, "backend": "fortran"}, "backend"),

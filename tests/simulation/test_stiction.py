@@ -107,7 +107,7 @@ def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
     monkeypatch.setattr(codegen, "CompiledRollout", refuse)
     monkeypatch.setattr(compiled, "_known", type(compiled._known)())
     eager = slide(2.5, v0=-0.1, steps=200)
-    assert "eager torch, as they cannot be compiled: no compiler" in caplog.text
+    assert "eager torch, because they cannot be compiled: no compiler" in caplog.text
     torch.testing.assert_close(eager.q, fast.q, rtol=0, atol=1e-12)
     torch.testing.assert_close(eager.qd, fast.qd, rtol=0, atol=1e-12)
 

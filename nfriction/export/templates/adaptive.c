@@ -1,18 +1,18 @@
 /*
  * Classes of acceleration: low, medium and high. The memory of a joint is the envelope of |qdd|,
  * which rises at once and fades slowly, and the class. A class is entered above its upper border
- * and left below its lower one; at the start the borders are those in the middle.
+ * and left below its lower one; at the start their middle is the border.
  */
 {{ table("middle", 2, "JOINTS") }}
 {{ table("upper", 2, "JOINTS") }}
 {{ table("lower", 2, "JOINTS") }}
-/* Size of acceleration over velocity, for the envelope of a motion that starts at full speed. */
+/* Ratio of acceleration to velocity, for the envelope of a motion that starts at full speed. */
 {{ table("swing_rate", "JOINTS") }}
-/* The envelope rises to here at most: one wild value must not keep the class for long. */
+/* Limit of the envelope: a single outlier must not keep the class for long. */
 {{ table("ceiling", "JOINTS") }}
 {{ table("by_class", 3, "COEFFICIENTS", "JOINTS") }}
 
-/* Number of borders below an envelope: the class. */
+/* The class: number of borders below an envelope. */
 static int nf_above(REAL envelope, const REAL border[2][NF_JOINTS], int j)
 {
     return (envelope > border[0][j]) + (envelope > border[1][j]);

@@ -1,4 +1,4 @@
-// {{ title }} on an Arduino. Put this file, {{ name }}.c and {{ name }}.h into one folder that is called
+// {{ title }} on an Arduino. Put this file, {{ name }}.c and {{ name }}.h into one folder called
 // {{ name }}; write `read_position`{% if loaded %}, `read_torque`{% endif %} and `write_torque` for your board.
 extern "C" {
 #include "{{ name }}.h"
@@ -16,9 +16,9 @@ static nf_filter filter;
 #endif
 static unsigned long next_call;
 
-// Share of the friction that is compensated: 1 drives the joint where the model is a little high.
+// Share of the friction that is compensated: 1 drives the joint if the model is slightly too high.
 static const nf_real GAIN = (nf_real)0.8;
-// Velocity below which the torque fades, against chatter about standstill [{{ unit }}/s].
+// Velocity below which the torque fades out, against chatter near standstill [{{ unit }}/s].
 static const nf_real DEAD_BAND = (nf_real)0.05;
 
 // Position [{{ unit }}] of a joint, the first from upright, others relative; here from an analogue pin over one turn.
@@ -27,7 +27,7 @@ static double read_position(int joint)
     return analogRead(A0 + joint) * (6.283185307179586 / 1023.0);
 }
 
-// Hand out the torque that compensates friction [{{ torque_unit }}]; 0 where it is not to be trusted.
+// Output the torque that compensates friction [{{ torque_unit }}]; 0 where it is not reliable.
 static void write_torque(int joint, nf_real tau, nf_real qd, int status)
 {
     const nf_real speed = qd < 0 ? -qd : qd;
@@ -74,7 +74,7 @@ void loop()
     nf_real coefficients[NF_JOINTS * NF_COEFFICIENTS];
     int status[NF_JOINTS];
     int j;
-    // Unsigned differences stay right when the clock wraps.
+    // Unsigned differences stay correct when the clock wraps.
     if ((long)(micros() - next_call) < 0)
         return;
     next_call += PERIOD;
@@ -82,7 +82,7 @@ void loop()
     read_positions(q);
     nf_filter_step(&filter, q, qd, qdd);
 #else
-    // Export with the filter inside for anything better than plain differences.
+    // For anything better than plain differences, export with the filter (--with-filter).
     for (j = 0; j < NF_JOINTS; ++j) {
         const double position = read_position(j);
         const nf_real velocity = (nf_real)((position - q[j]) * (1e6 / PERIOD));

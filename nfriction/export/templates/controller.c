@@ -19,7 +19,7 @@
 {% endif %}
 {% if limited %}
 
-/* Largest torque given out. */
+/* Limit of the output torque. */
 {{ table("torque_limit", "JOINTS") }}
 {% endif %}
 
@@ -78,7 +78,7 @@ void nf_step(
 {% endif %}
     (void)n;
 
-    /* A joint whose inputs are not finite is computed at rest, and given NaN in the end. */
+    /* A joint with inputs that are not finite is computed at rest, and gets NaN at the end. */
     for (j = 0; j < NF_JOINTS; ++j) {
         const int moves = nf_finite(&qd[j]) && nf_finite(&qdd[j]);
         sound[j] = moves && nf_finite(&load[j]);
@@ -86,7 +86,7 @@ void nf_step(
         a[j] = moves ? qdd[j] : 0;
         n[j] = sound[j] ? load[j] : 0;
 {% if by_class %}
-        /* Its memory stays. */
+        /* Without motion the memory is unchanged. */
         if (moves)
             nf_class_advance(a[j], state->memory + NF_STATE_SIZE * j, j);
         known[j] = (int)state->memory[NF_STATE_SIZE * j + 1];
@@ -131,7 +131,7 @@ void nf_step(
 
 {% endif %}
 
-    /* Torque by the law, {{ law_comment }}. */
+    /* Torque from the law, {{ law_comment }}. */
 {{ law }}
 
     for (j = 0; j < NF_JOINTS; ++j) {

@@ -2,12 +2,12 @@
  * {{ safe(about.model) }}: friction of {{ joints }} joints, made by nfriction {{ safe(about.version) }} (schema {{ about.schema }}).
  *
  * Inputs: qd [{{ safe(about.units.qd) }}], qdd [{{ safe(about.units.qdd) }}], load [{{ safe(about.units.load) }}].
- * Outputs: tau [{{ safe(about.units.tau_f) }}], on the left of M(q) qdd + bias(q, qd) + tau = drive; coefficients:
+ * Outputs: tau [{{ safe(about.units.tau_f) }}], on the left side of M(q) qdd + bias(q, qd) + tau = drive; coefficients:
 {% for coefficient in about.coefficients %}
  *     {{ safe(coefficient.name) }} [{{ safe(coefficient.unit) }}]
 {% endfor %}
 {% if drive_torques | select | list %}
- * Not in tau: constant torques of the drives in the fitted plant, to subtract from a command:
+ * Not in tau: constant torques of the drives in the fitted plant, to be subtracted from a command:
  *    {% for x in drive_torques %} {{ "%.3g" % x }}{% endfor %} [{{ safe(about.units.tau_f) }}]
 {% endif %}
  * Sample time: {{ "any" if about.sample_time is none else "%.9g s" % about.sample_time }}.
@@ -20,7 +20,7 @@
  *     {{ safe(name) }}: {{ safe(edges) }}
 {% endfor %}
  * Outside them (OUTSIDE): {{ safe(about.edges.outside_input_ranges) }}.
- * NaN or infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too.
+ * NaN or infinity gives NaN for that joint (NOT_FINITE), also under -ffast-math.
  * SATURATED: the torque limit.
  * Torque limit: {{ "none" if about.torque_limit is none else safe(about.torque_limit) }}.
  * Filter: {{ "none" if about.filter is none else safe(about.filter) }}.
@@ -49,7 +49,7 @@ extern "C" {
 typedef REAL nf_real;
 
 {% if state_size %}
-/* What the coefficients remember of earlier samples. */
+/* State of the coefficients from earlier samples. */
 typedef struct {
     nf_real memory[NF_JOINTS * NF_STATE_SIZE];
 } nf_state;
@@ -60,13 +60,13 @@ void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_
 {% endif %}
 {% if load %}
 /* Load of each joint, which this law reads, at joint positions and velocities: the first angle from
- * upright, each further one relative to the link before [{{ safe(about.unit) }}]. */
+ * upright, each further one relative to the previous link [{{ safe(about.unit) }}]. */
 void nf_load(
     const nf_real q[NF_JOINTS], const nf_real qd[NF_JOINTS], nf_real load[NF_JOINTS]);
 
 {% endif %}
 /* Friction torque, coefficients (joint by joint) and status bits of every joint.
- * No array may be NULL, and no output may lie where an input does. */
+ * No array may be NULL, and no output may overlap an input. */
 void nf_step(
 {% if state_size %}
     nf_state *state,
@@ -77,16 +77,16 @@ void nf_step(
 
 {% if filter_size %}
 /* Two causal low-pass filters in series, each of 2 states, and the last position and velocity.
- * Positions are double: their differences would cost float its digits. */
+ * Positions are double, because their differences in float would lose precision. */
 typedef struct {
     double memory[NF_JOINTS * NF_FILTER_SIZE];
 } nf_filter;
 
-/* A filter that has rested at positions q; the same to start anew. */
+/* Filter after rest at positions q; init and reset are the same. */
 void nf_filter_init(nf_filter *filter, const double q[NF_JOINTS]);
 void nf_filter_reset(nf_filter *filter, const double q[NF_JOINTS]);
 
-/* Velocity and acceleration of one more sample, to be taken at the sample time. */
+/* Velocity and acceleration after one more sample; call once per sample time. */
 void nf_filter_step(
     nf_filter *filter, const double q[NF_JOINTS], nf_real qd[NF_JOINTS], nf_real qdd[NF_JOINTS]);
 

@@ -7,8 +7,8 @@ typedef long nf_whole;
 typedef char nf_float_has_32_bits[sizeof(float) == sizeof(nf_word) ? 1 : -1];
 {% endif %}
 
-/* exp(x) - less of numbers <= 0, in place: x = k ln 2 + r, a polynomial in r, and 2^k by the bits
- * of a float (0 where that is too small for one). No branches, so that compilers vectorise it. */
+/* exp(x) - less for numbers <= 0, in place: x = k ln 2 + r, a polynomial in r, and 2^k from the
+ * bits of a float (0 if too small for one). No branches, so that compilers vectorise it. */
 static void nf_exp(REAL *x, int count, REAL less)
 {
     int i;

@@ -1,4 +1,4 @@
-/* The causal filter, in double always: differences of positions cost digits that float lacks. */
+/* The causal filter, always in double, because float is too coarse for differences of positions. */
 static double nf_low_pass(double x, double s[2])
 {
     const double y = {{ filter.b0 }} * x + s[0];

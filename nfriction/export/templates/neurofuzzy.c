@@ -2,8 +2,8 @@
 /*
  * Coefficients by a neuro-fuzzy network of each joint: Gaussian sets of |qd| and of qdd, a rule for
  * every pair of them, and a head of radial units that adds a correction. The joint is the last
- * index everywhere: joints are computed side by side. Half the scale of the coefficients is part
- * of the tables.
+ * index everywhere: joints are computed in parallel. Half the scale of the coefficients is included
+ * in the tables.
  */
 #define NF_SETS {{ sets }}
 #define NF_UNITS {{ units }}
@@ -14,16 +14,16 @@
 {{ table("gain", 2, "JOINTS") }}
 {{ table("shift", 2, "JOINTS") }}
 {% if along_motion %}
-/* The acceleration counts along the motion: qdd tanh(RATE qd). */
+/* The acceleration is taken along the motion: qdd tanh(RATE qd). */
 {{ table("rate", "JOINTS") }}
 {% endif %}
 /* The membership in set s of input i is exp(-(SET_SLOPE[s][i] x + SET_SHIFT[s][i])^2). */
 {{ table("set_slope", "SETS", 2, "JOINTS") }}
 {{ table("set_shift", "SETS", 2, "JOINTS") }}
-/* The rule of sets s of |qd| and t of qdd says PLANE[t][s]: for every coefficient a slope by |qd|,
- * then the slopes by qdd, then the constants. */
+/* The rule of sets s of |qd| and t of qdd gives PLANE[t][s]: for every coefficient its slope in |qd|,
+ * then the slopes in qdd, then the constants. */
 {{ table("plane", "SETS", "SETS", "PLANES", "JOINTS") }}
-/* A unit sees both inputs and the coefficients by the rules, and adds
+/* A unit takes both inputs and the coefficients from the rules, and adds
  * UNIT_WEIGHT exp(-sum of (UNIT_SLOPE seen + UNIT_SHIFT)^2). */
 {{ table("unit_slope", "SEEN", "UNITS", "JOINTS") }}
 {{ table("unit_shift", "SEEN", "UNITS", "JOINTS") }}
@@ -46,7 +46,7 @@ static void nf_network(
     REAL unit[NF_UNITS{{ " + 3" if spare(units * joints) }}][NF_JOINTS]{{ " = {{0}}" if spare(units * joints) }};
     int s, i, k, j;
 
-    /* 1. Scaled inputs within the trained range; trust fades from 1 there to 0 far outside. */
+    /* 1. Scaled inputs within the trained range; trust falls from 1 there to 0 far outside. */
     for (j = 0; j < NF_JOINTS; ++j) {
         const REAL speed = NF_GAIN[0][j] * real_abs(qd[j]) + NF_SHIFT[0][j];
         const REAL acceleration = NF_GAIN[1][j] * ({{ "sign[j] * qdd[j]" if along_motion else "qdd[j]" }}) + NF_SHIFT[1][j];
@@ -76,7 +76,7 @@ static void nf_network(
 {% endif %}
     nf_exp(&membership[0][0][0], NF_SETS * 2 * NF_JOINTS{{ spare(2 * sets * joints) }}, 0);
 
-    /* 3. A rule fires by the product of its memberships: its plane is blended with the others'. */
+    /* 3. Rules fire with the product of their memberships, by which their planes are weighted. */
     for (i = 0; i < NF_PLANES; ++i)
         for (j = 0; j < NF_JOINTS; ++j) {
             REAL blend = 0;
@@ -86,7 +86,7 @@ static void nf_network(
             plane[i][j] = blend;
         }
 
-    /* 4. Coefficients by the rules, whose firing strengths are divided by their sum. */
+    /* 4. Coefficients from the rules, whose firing strengths are divided by their sum. */
     for (j = 0; j < NF_JOINTS; ++j) {
         const REAL by_qd = {{ sum("membership[@][0][j]", sets, 12) }};
         const REAL by_qdd = {{ sum("membership[@][1][j]", sets, 12) }};
@@ -96,7 +96,7 @@ static void nf_network(
                 + plane[NF_COEFFICIENTS + k][j] * seen[1][j] + plane[2 * NF_COEFFICIENTS + k][j]);
     }
 
-    /* 5. The radial units, and the reference corrected by all of it. */
+    /* 5. The radial units; rules and units correct the reference. */
     for (s = 0; s < NF_UNITS; ++s)
         for (j = 0; j < NF_JOINTS; ++j)
             unit[s][j] = nf_max({{ least_exponent }}, -(
@@ -110,7 +110,7 @@ static void nf_network(
             c[k][j] = NF_REFERENCE[k][j] + trust[j] * u;
         }
 
-    /* 6. Coefficients, positive where physics has them so. */
+    /* 6. Coefficients, positive where physics requires it. */
 {% for first, last, positive in signs_of_coefficients %}
     for (k = {{ first }}; k < {{ last }}; ++k)
         for (j = 0; j < NF_JOINTS; ++j) {

@@ -1,4 +1,4 @@
-/* A word of 32 bits; the build stops where {{ real }} has not {{ 32 * words }}. */
+/* A word of 32 bits; the build stops if {{ real }} does not have {{ 32 * words }}. */
 #if UINT_MAX == 0xFFFFFFFFUL
 typedef unsigned int nf_word;
 #else
@@ -18,7 +18,7 @@ static int nf_high(void)
 }
 
 {% endif %}
-/* By the bits: under -ffast-math a compiler takes every number for finite. */
+/* From the bits, because under -ffast-math a compiler assumes every number to be finite. */
 static int nf_finite(const REAL *x)
 {
     nf_word words[{{ words }}];

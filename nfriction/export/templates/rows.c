@@ -1,4 +1,4 @@
-/* Runs a controller over rows of samples, for the comparison with its model. */
+/* Runs a controller over rows of samples, for comparison with its model. */
 #include "{{ name }}.c"
 
 void run_rows(long rows, const double *const *in, double *tau, double *coefficients, int *status);

@@ -1,4 +1,4 @@
-/* Runs the controller over the test vectors of its model; returns 0 where all of them agree. */
+/* Runs the controller on the test vectors of its model; returns 0 if all of them agree. */
 #include <limits.h>
 #include <stdio.h>
 #include <string.h>
@@ -9,7 +9,7 @@
 #define COEFFICIENT_TOLERANCE {{ coefficient_tolerance }}
 
 {% include "numbers.c" %}
-/* A number that is not finite, by its kind: 1 NaN, 2 infinity, 3 minus infinity. */
+/* A number that is not finite, by kind: 1 NaN, 2 infinity, 3 minus infinity. */
 static void broken(REAL *x, int kind)
 {
     const REAL one = 1;

@@ -1,6 +1,6 @@
 /* Level-2 S-function around {{ name }}.h. Build it together with the controller:
  *     mex {{ name }}_sfun.c {{ name }}.c
- * Inputs: velocity, acceleration and, as {{ name }}.h has a function of the load or not, joint
+ * Inputs: velocity, acceleration and, depending on a load function in {{ name }}.h, joint
  * position or load; outputs: torque, coefficients (joint by joint) and status bits. Runs at the sample time of the block that drives it.
  */
 #define S_FUNCTION_NAME {{ name }}_sfun

@@ -11,7 +11,7 @@ namespace {{ prefix }} {
 using Real = nf_real;
 using Joints = std::array<Real, NF_JOINTS>;
 
-// What one call gives: torque, coefficients joint by joint, and status bits of every joint.
+// Result of one call: torque, coefficients joint by joint, and status bits of every joint.
 struct Output {
     Joints tau;
     std::array<Real, NF_JOINTS * NF_COEFFICIENTS> coefficients;
@@ -22,7 +22,7 @@ struct Output {
     }
 };
 
-// Velocity, acceleration and load to friction torque; one object a mechanism, no heap.
+// Velocity, acceleration and load to friction torque; one object per mechanism, no heap.
 class Friction {
 public:
     static constexpr int joints = NF_JOINTS;
@@ -80,7 +80,7 @@ public:
         return friction_.step(qd, qdd, load);
     }
 
-    // Start anew as if the joints had rested at `q`.
+    // Start again as if the joints had rested at `q`.
     void reset(const Positions &q) {
         nf_filter_init(&filter_, q.data());
         friction_.reset();

@@ -1,6 +1,6 @@
 """Arguments of a fit, checked and converted: recordings, motions, adjustable plant terms.
 
-Warnings name signs in recordings that they are not what the plant and the fit assume.
+Warnings report signs that recordings violate the assumptions of the plant and the fit.
 """
 
 import logging
@@ -36,17 +36,17 @@ from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
-# Share of the slowest joint's largest velocity within which the sign of a model made by name turns:
-# the default of 3 mrad/s, or mm/s, where it reaches 3 rad/s, or m/s.
+# Width of the smoothed sign of a model made by name, as a share of the slowest joint's largest
+# velocity: the default of 3 mrad/s (mm/s) if that velocity reaches 3 rad/s (m/s).
 TURN_SHARE = 1e-3
-# Jumps whose sizes differ by less than this share are alike.
+# Jumps whose sizes differ by less than this fraction count as equal.
 ALIKE = 0.02
 
 
 def as_model(
     model: FrictionModel | str, joints: int, motions: Sequence[Motion] = ()
 ) -> FrictionModel:
-    """A model as it is, or a new one by its name, whose sign turns as fast as the motions ask.
+    """The given model, or a new one by its name, with a smoothed sign that suits the motions.
 
     Raises:
         TypeError: for anything else.
@@ -63,18 +63,18 @@ def as_model(
 
 
 def turning_velocity(motions: Sequence[Motion]) -> float:
-    """Velocity within which the sign of the velocity turns [rad/s; m/s].
+    """Width of the smoothed sign of the velocity [rad/s; m/s].
 
-    A joint that friction holds creeps at about this velocity, so it is a small share of the largest
-    one, of the slowest joint. It is not below what an integration step takes off the velocity, or
-    friction would be too steep there.
+    A joint that friction holds creeps at about this velocity, so it is a small share of the slowest
+    joint's largest velocity. It is at least the change of velocity in an integration step, because
+    friction would otherwise be too steep.
     """
     if not motions:
         return V_SMOOTH
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
     taken = max(float(np.abs(m.qdd).max() * np.median(np.diff(m.time))) for m in motions)
-    # Half the substeps, as friction is not known yet.
+    # Half the substeps, because friction is not known yet.
     least = taken / (RK4_STABILITY * DEFAULTS.max_substeps / 2)
     return min(V_SMOOTH, max(TURN_SHARE * slowest, least))
 
@@ -85,7 +85,7 @@ def as_recording_list(
     """The recordings of a fit as a list.
 
     Raises:
-        TypeError: if one is something else than `Recording.of` takes.
+        TypeError: if one is not accepted by `Recording.of`.
         ValueError: if a recording is given twice.
     Warns:
         UserWarning: if only some recordings have torques.
@@ -97,30 +97,30 @@ def as_recording_list(
 
 
 def _refuse_repeated(recordings: Sequence[Recording]) -> None:
-    """Refuse the same data twice, by whatever name: counted twice, it would narrow intervals."""
+    """Refuse the same data twice, under any name, because that would narrow intervals."""
     first: dict[str, int] = {}
     for k, recording in enumerate(recordings):
-        # Blocks of a recording may hold the same rest.
+        # Several blocks of a recording may contain the same rest.
         if not np.ptp(recording.q, axis=0).any():
             continue
         before = first.setdefault(recording.digest(), k)
         if before != k:
             names = (recordings[before].name or "unnamed", recording.name or "unnamed")
             raise ValueError(
-                f"a fit takes every recording once, got the same data as recordings {before + 1} "
-                f"({names[0]}) and {k + 1} ({names[1]}); leave one out."
+                f"a recording can be given only once, but recordings {before + 1} ({names[0]}) and "
+                f"{k + 1} ({names[1]}) contain the same data; leave one out."
             )
 
 
 def warn_of_undriven(recordings: Sequence[Recording]) -> None:
-    """Warn of recordings without torque beside others that have it."""
+    """Warn of recordings without torque if others have it."""
     free = [r.name or f"recording {k + 1}" for k, r in enumerate(recordings) if r.tau is None]
     if 0 < len(free) < len(recordings):
         names = ", ".join(dict.fromkeys(free))
-        # Not of a category that is silenced once recordings are read. One place, so shown once.
+        # Not of the category that is silenced once recordings are read; one place, so shown once.
         warnings.warn(
-            f"no torque is recorded in {names}, unlike in other recordings, so nothing "
-            f"is taken to drive the joints there; add the torque, or zeros where there was none.",
+            f"no torque is recorded in {names}, unlike in other recordings, so the joints "
+            f"are taken to be undriven there; add the torque, or zeros if there was none.",
             stacklevel=1,
         )
 
@@ -131,7 +131,7 @@ def require_drive(law: Law, recordings: Sequence[Recording]) -> None:
     if free and law.reads_drive:
         raise ValueError(
             f"no torque is recorded in {', '.join(dict.fromkeys(free))}, and {law.name} reads the "
-            "drive's torque; add tau or take dahl."
+            "drive's torque; add tau or use dahl."
         )
 
 
@@ -145,11 +145,11 @@ def in_joint_coordinates(
         joints = recording.q.shape[1]
         if joints != plant.joints or joints != modelled:
             raise ValueError(
-                f"recording, plant and model must have as many joints, got {joints} in "
+                f"recording, plant and model must have equally many joints, got {joints} in "
                 f"{recording.name}, {plant.joints} and {modelled}."
             )
     conventions = {str(r.resolve_convention(plant)) for r in recordings}
-    # Residuals are formed as the encoders read, by one matrix for all windows.
+    # Residuals are formed in recorded coordinates, with one matrix for all windows.
     if len(conventions) > 1:
         raise ValueError(
             "recordings fitted together must share one angle convention, got "
@@ -161,14 +161,14 @@ def in_joint_coordinates(
 def smoothed_motions(
     joint: Sequence[Recording], motions: Sequence[Motion] | None
 ) -> tuple[Motion, ...]:
-    """The smoothed motion of each recording in joint coordinates; those given, if they match."""
+    """The smoothed motion of each recording in joint coordinates; given ones must match."""
     if not motions:
         return tuple(kalman_smoother(r.time, r.q) for r in joint)
     if [len(m.q) for m in motions] != [len(r) for r in joint]:
         raise ValueError(
-            f"`motions` must be one of each recording, sample by sample, got {len(motions)} of "
+            f"`motions` must match the recordings sample by sample, got {len(motions)} of "
             f"{sum(len(m.q) for m in motions)} samples for {len(joint)} recordings of "
-            f"{sum(map(len, joint))}; left out, they are computed."
+            f"{sum(map(len, joint))}; if omitted, they are computed."
         )
     return tuple(motions)
 
@@ -180,13 +180,13 @@ def largest_torques(joint: Sequence[Recording]) -> NDArray[np.float64]:
 
 
 def is_undriven_pendulum(plant: Plant, joint: Sequence[Recording]) -> bool:
-    """True for a chain on a fixed pivot that gravity moves, without any torque."""
+    """True for a chain on a fixed pivot that moves under gravity without any torque."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
     return fixed and weighs(plant) and not largest_torques(joint).any()
 
 
 def weighs(plant: Plant) -> bool:
-    """True for a chain whose pose matters to gravity."""
+    """True for a chain whose gravity torque depends on its pose."""
     return isinstance(plant, PendulumChain) and has_weight(
         plant.gravity_moment, plant.inertia_coupling
     )
@@ -202,14 +202,14 @@ def adjustable_terms(
 ) -> list[PlantParameter]:
     """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    If encoders have an offset `per_recording`, the plant's would only be the mean of these. The
-    torque's delay comes last.
+    If encoders have an offset `per_recording`, the plant has none, since it would only be their
+    mean. The torque's delay comes last.
     """
     delay = [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
         return delay
     largest = largest_torques(joint)
-    # Over spans that are long against a step of the encoder.
+    # Over spans that are long compared with one encoder count.
     spans = [max(1, len(r) // 200) for r in joint]
     rates = [
         np.abs(r.q[k:] - r.q[:-k]) / (r.time[k:] - r.time[:-k])[:, None]
@@ -240,10 +240,10 @@ def apply_encoder_offsets(
     """Recordings and motions as if their encoders had no offsets.
 
     Args:
-        offsets: `FitResult.encoder_offsets`, one row a recording; none leaves all as it is.
+        offsets: `FitResult.encoder_offsets`, one row per recording; empty for no change.
         plant: the mechanism.
-        recordings: in any one convention.
-        motions: theirs, in joint coordinates.
+        recordings: all in one convention.
+        motions: of the recordings, in joint coordinates.
     """
     if not offsets:
         return list(recordings), tuple(motions)
@@ -266,20 +266,20 @@ def integration_substeps(
     needed, most = required_substeps(plant, model, longest_step), options.max_substeps
     if needed > most:
         logger.warning("near rest a sample needs %d integration steps, fits take %d", needed, most)
-    # Twice the present need, as coefficients may grow during the search.
+    # Twice the present need, because coefficients may grow during the search.
     return min(1 if needed == 1 else 2 * needed, most)
 
 
 Array = NDArray[np.float64]
 
 ZEROED_PER_RECORDING = (
-    "Every recording begins at rest with all encoders at zero; assumed that they were zeroed "
-    "there, in whatever pose; scores estimate it from the first second, which they leave out. If "
-    'not: `encoder_reference="shared"`.'
+    "Every recording begins at rest with all encoders at zero, so they are assumed to have been "
+    "zeroed there, in an arbitrary pose; scores estimate it from the first second, which is not "
+    'scored. If this is wrong: `encoder_reference="shared"`.'
 )
 # Density of steel [kg/m^3].
 STEEL = 7_850.0
-# Error of angles from one conversion to the next, with room.
+# Bound of the error of angles after conversions.
 ROUNDING = 1e-9
 
 
@@ -288,8 +288,8 @@ def looks_zeroed_per_recording(
 ) -> bool:
     """True if encoders seem to have been set to zero at the start of each recording.
 
-    Dry friction holds links wherever they stop. Where a driven chain begins several recordings at
-    rest, and all its encoders read zero each time, they were set to it.
+    Dry friction holds links wherever they stop. If a driven chain begins several recordings at rest
+    and all its encoders read zero each time, they must have been set to zero.
     """
     return (
         weighs(plant)
@@ -309,7 +309,7 @@ def data_warnings(
     motions: Sequence[Motion],
     options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
-    """Warnings about recordings as written and in joint coordinates, a sentence each."""
+    """Warnings about recordings as given and in joint coordinates, one sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
     of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *_finer_count(plant, given)
@@ -323,7 +323,7 @@ def _finer_count(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
     if plant.position_quantum is not None and 1.5 * seen < plant.position_quantum:
         yield (
             f"Positions change by {seen:.3g} {plant.unit}, less than the `position_quantum` of "
-            f"{plant.position_quantum:.3g}; give one count as the joint moves, behind a gear."
+            f"{plant.position_quantum:.3g}; give one count as motion of the joint, after any gear."
         )
 
 
@@ -333,14 +333,14 @@ def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
     if still:
         raise ValueError(
             f"{', '.join(still)} never moves in {', '.join(r.name or 'a recording' for r in joint)}"
-            ", and neuro-fuzzy coefficients follow the motion; record it moving."
+            ", but neuro-fuzzy coefficients follow the motion; record it moving."
         )
 
 
 def _ranges(joint: Sequence[Recording]) -> Array:
     """Range of each joint in the recording in which it moves most, (joint,)."""
     ranges = np.max([np.ptp(r.q, axis=0) for r in joint], axis=0)
-    # The difference of two absolute angles that turn together is rounding.
+    # The difference of two absolute angles that turn together is only rounding.
     largest = max(float(np.abs(r.q).max()) for r in joint)
     return np.where(ranges > ROUNDING * largest, ranges, 0.0)
 
@@ -349,7 +349,7 @@ def _still_joints(
     plant: Plant, given: Sequence[Recording], joint: Sequence[Recording], min_counts: int
 ) -> Iterator[str]:
     if plant.position_quantum is None:
-        # A joint that nowhere shows its count is not measured by it.
+        # A joint without a visible count is not compared with one.
         count = np.fmin.reduce([count_seen(r.q) for r in given])
     else:
         count = np.full(plant.joints, plant.position_quantum)
@@ -364,7 +364,7 @@ def _still_joints(
 
 
 def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Recordings whose even steps differ by less than one chooses a rate to differ."""
+    """Recordings whose uniform steps differ by less than deliberately chosen rates would."""
     even = sorted((r for r in recordings if r.is_uniform), key=lambda r: r.sample_time)
     for fast, slow in pairwise(even):
         apart = slow.sample_time / fast.sample_time - 1
@@ -378,18 +378,18 @@ def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iter
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples far off both of their neighbours, to the same side, and jumps that last."""
+    """Single samples far from both neighbours, on the same side, and permanent jumps."""
     for recording in recordings:
         q, time = recording.q, recording.time
         before, after = q[1:-1] - q[:-2], q[1:-1] - q[2:]
         near, other = np.sort(np.abs([before, after]), axis=0)
-        # Steps, as at a gap in time, and samples beside a spike are far off one neighbour alone.
+        # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
         height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        # Steps, as if equally long, far above both that enclose them, which are alike; across a gap
-        # any is possible.
+        # Steps, scaled to equal length, far above both adjacent steps, which are similar; across a
+        # gap any step is possible.
         step = np.diff(q, axis=0) * (recording.sample_time / np.diff(time))[:, None]
         step[gaps(time)] = np.nan
         before, at, after = step[:-2], step[1:-1], step[2:]
@@ -410,7 +410,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 "samples are missing there without a gap in time, or the encoder lost counts",
                 "give samples their own times, or cut the recording there",
             )
-            # Twice by the same amount is no chance.
+            # Two jumps by the same amount are not chance.
             if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
@@ -432,6 +432,6 @@ def _implausible_masses(plant: Plant) -> Iterator[str]:
         if mass > STEEL * length**3:
             yield (
                 f"Link {k + 1} of {mass:g} kg and {length:g} m would be heavier than a cube of "
-                "steel that long; a free swing does not show the scale of masses, so friction is "
-                "too large by the same factor if they are in g."
+                "steel of that length; a free swing does not show the scale of masses, so if they "
+                "are in g, friction is too large by the same factor."
             )

@@ -1,4 +1,4 @@
-"""Recordings cut into shooting windows of equal length, each with an initial state of its own."""
+"""Recordings cut into shooting windows of equal length, each with its own initial state."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,13 +24,13 @@ class Windows:
         q: measured position, (window, step + 1, joint).
         tau: torque held over each step [N m; N], (window, step, joint).
         step: [s], (window, step); zero where a window ends early.
-        weight: 1 where a sample counts, 0 where it pads, (window, step + 1).
+        weight: 1 for a sample, 0 for padding, (window, step + 1).
         q0, qd0: smoothed initial state, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
-        recordings, motions: that the windows are of, in joint coordinates.
-        law_state: of a law with memory at the start of each window, over that of a contact that
-            slips slowly, (window, joint, state).
+        recordings, motions: from which the windows are cut, in joint coordinates.
+        law_state: of a law with memory at the start of each window, relative to that of a contact
+            that slips slowly, (window, joint, state).
         hidden_state: of the coefficients at the start of each window, (window, joint, state).
     """
 
@@ -70,9 +70,9 @@ class Windows:
     def with_states(self, plant: Plant, model: FrictionModel) -> "Windows":
         """The windows with the state of the friction at the start of each.
 
-        A hidden state of the coefficients is what the motion before leaves. Deflections of a law
-        with memory are those that balance the torques: the motion before would show them only where
-        it is known to a fraction of the displacement over which contacts yield.
+        A hidden state of the coefficients follows from the preceding motion. Deflections of a law
+        with memory are those that balance the torques: the preceding motion would show them only if
+        it were known to a fraction of the displacement over which contacts yield.
         """
         motions = [[torch.tensor(x) for x in (m.qd, m.qdd, m.time)] for m in self.motions]
         hidden = law_state = None
@@ -107,7 +107,7 @@ class Windows:
         tau, slope = torch.zeros_like(self.tau), torch.zeros_like(self.tau)
         for w, (place, first, last) in enumerate(self.spans):
             recording = self.recordings[place]
-            # A sample wide, as a line between samples has kinks at them.
+            # Over one sample, because interpolation has kinks at the samples.
             half = 0.5 * recording.sample_time
             at = recording.time[first:last] + delay
             now, ahead, behind = (
@@ -130,8 +130,8 @@ def cut_windows(
     Args:
         recordings, motions: in joint coordinates; a recording shorter than `length` is one window.
         length: [s].
-        rest_speed: recordings that begin slower than this [rad/s] start from rest, and not from the
-            smoothed motion; by default none does.
+        rest_speed: recordings that begin slower than this [rad/s] start from rest instead of from
+            the smoothed motion; by default none does.
 
     Raises:
         ValueError: if a recording has so few samples that no window fits.
@@ -154,7 +154,7 @@ def cut_windows(
     for w, (place, first, last) in enumerate(spans):
         recording, n = recordings[place], last - first
         q[w, : n + 1] = recording.q[first : last + 1]
-        # Steps of no length and no weight: padding changes neither motion nor cost.
+        # Steps of zero length and weight: padding changes neither motion nor cost.
         q[w, n + 1 :] = recording.q[last]
         step[w, :n] = np.diff(recording.time[first : last + 1])
         weight[w, : n + 1] = 1.0
@@ -175,7 +175,7 @@ def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
     """First and last sample of each window."""
     for first, last in recording.segments:
         duration = recording.time[last] - recording.time[first]
-        # Windows of equal length: a short remainder would hardly determine its initial state.
+        # Windows of equal length, since a short remainder would hardly determine its initial state.
         count = max(1, int(duration / length + 0.5))
         if count > last - first:
             raise ValueError(

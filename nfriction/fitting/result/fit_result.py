@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Usability = Literal["good", "doubtful", "do not use"]
-# Normalised root mean square error that makes a fit doubtful: a fit of less than 99 % as system
-# identification counts it (L. Ljung, System Identification, 2nd ed. 1999, section 16.3).
+# Normalised root mean square error that makes a fit doubtful: a fit below 99 % as defined in system
+# identification (L. Ljung, System Identification, 2nd ed. 1999, section 16.3).
 DOUBTFUL_ERROR = 0.01
-# Standard deviation of an angle of which nothing is known [rad].
+# Standard deviation of a completely unknown angle [rad].
 UNIFORM_TURN = math.pi / 3**0.5
 
 
@@ -41,8 +41,8 @@ class InputGain:
 
     Attributes:
         name: of the input.
-        share: by all joints.
-        by_joint: by each joint's coefficient alone, (joint,).
+        share: with all joints.
+        by_joint: with each joint's coefficient alone, (joint,).
     """
 
     name: str
@@ -56,8 +56,8 @@ class InputGain:
             for joint, share in zip(joint_names, self.by_joint, strict=True)
         )
         return (
-            f"Input {self.name}: {-100 * self.share:.0f} % unexplained motion "
-            f"(by one joint alone: {alone})."
+            f"Input {self.name} reduces the unexplained motion by {100 * self.share:.0f} % "
+            f"(with one joint alone: {alone})."
         )
 
 
@@ -73,33 +73,33 @@ class FitResult:
         status: `"Converged ..."` or `"Not converged: ..."` with the reason.
         converged: whether the search ended at a minimum.
         residual: root mean square residual in `residual_unit`: of the positions over the training
-            windows, or of the torque after an equation-error fit; as a robust loss counts them.
+            windows, or of the torque after an equation-error fit; weighted by a robust loss.
         at_bounds: names of parameters at a bound.
         steps: accepted steps of the last stage.
         motions: smoothed motion of each recording, in joint coordinates.
         residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
             after an equation-error fit.
-        intervals: 95 % confidence intervals of constant coefficients and plant terms, by the
-            effective sample size of autocorrelated residuals. After an equation-error fit they take
-            the plant and the smoothed motion for exact.
+        intervals: 95 % confidence intervals of constant coefficients and plant terms, from the
+            effective sample size of autocorrelated residuals. After an equation-error fit they
+            assume that the plant and the smoothed motion are exact.
         unidentifiable: parameters, or combinations `"a with b"`, that the data do not determine.
-        warnings: a sentence each.
+        warnings: one sentence each.
         encoder_offsets: added to the recorded positions to get true ones, in joint coordinates
-            [rad; m], one row a recording; empty unless encoders were zeroed at each.
+            [rad; m], one row per recording; empty unless encoders were zeroed at each.
         uncertainty: standard deviation of the coefficients at any motion; None after an
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
-        mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
-        unmodelled: of `data_warnings`, changes of friction, play and delays that the fit lacks.
-        noise: root mean square residual of a right law, by the noise of encoders and torque
-            [rad; m]; None after an equation-error fit.
-        stages: length of the windows of each stage that was kept [s], and its residual in
-            `residual_unit`; of constant coefficients.
+        mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; also inherited.
+        unmodelled: those of `data_warnings` on changes of friction, play and unfitted delays.
+        noise: root mean square residual that a correct law would have from the noise of encoders
+            and torque [rad; m]; None after an equation-error fit.
+        stages: window length of each stage that was kept [s], and its residual in
+            `residual_unit`; for constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
-        outliers: stretches of samples that a robust loss counts less than half.
-        effective_parameters: of a network: name of each group of its parameters, how many of them
+        outliers: consecutive samples to which a robust loss gives less than half weight.
+        effective_parameters: for a network: name of each group of its parameters, how many of them
             the data determine (MacKay's gamma), and how many there are.
-        inputs: of a network: further inputs that the fit chose, and what each explains.
+        inputs: for a network: further inputs that the fit selected, and how much each explains.
     """
 
     model: FrictionModel
@@ -128,7 +128,7 @@ class FitResult:
     inputs: tuple[InputGain, ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
-        """The last of growing window lengths that the constant law could follow [s]."""
+        """The longest of growing window lengths that the constant law could follow [s]."""
         usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
         return usable[-1] if usable else windows[0]
 
@@ -151,17 +151,17 @@ class FitResult:
     def usability(self) -> tuple[Usability, str]:
         """Fitness for simulation and control, and the reason in a clause.
 
-        The residual is judged by how far the joints move: a fine encoder shows errors that hardly
-        matter, and noise is no error of the model.
+        The residual is judged relative to the range of motion, because a fine encoder shows errors
+        that hardly matter; noise is not an error of the model.
         """
         noise = math.inf if self.noise is None else self.noise
         moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
-        # A joint that turns over and over is somewhere on its circle.
+        # A joint that keeps turning over can be anywhere on its circle.
         most = UNIFORM_TURN**2 if self.plant.unit == "rad" else math.inf
         motion = math.sqrt(np.minimum(moved, most).mean())
         above = self.residual > DEFAULTS.model_error_ratio * noise
         wrong = above and self.residual > DOUBTFUL_ERROR * motion
-        # A recording at rest has no motion to compare with.
+        # A recording at rest has no motion for comparison.
         far = "the residual is larger than the motion"
         if wrong and self.residual < motion:
             far = (
@@ -169,7 +169,7 @@ class FitResult:
                 f"deviation, and {self.residual / noise:.0f} times the measurement noise"
             )
         reasons = [f"a mistake in data or rig is likely: {x}" for x in self.mistakes[:1]]
-        # A regression on torques follows no motion that would excuse a mistake.
+        # A regression on torques simulates no motion that could excuse a mistake.
         if reasons and (wrong or not self.converged or self.noise is None):
             return "do not use", reasons[0]
         if wrong and not self.converged:
@@ -182,9 +182,9 @@ class FitResult:
             reasons.append("friction changes, a gear has play or there is a delay, see warnings")
         if wrong:
             reasons.append(far)
-        # A motion depends on the sum of such terms of the rig (link and rotor inertia) alone.
+        # Terms of the rig do not count: a motion may depend only on their sum (link and rotor).
         joints, schedule = self.plant.joint_names, self.model.schedule
-        # Names of the constant law, too: it may be kept instead of a network or classes.
+        # Including names of the constant law, which may be kept instead of a network or classes.
         law = {f"{name} of {joint}" for name in schedule.coefficient_names for joint in joints}
         names = law.union(schedule.parameter_names(joints))
         if count := sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable):
@@ -209,13 +209,13 @@ class FitResult:
         return "N" if self.plant.unit == "m" else "N m"
 
     def rule_seconds(self) -> list[list[float]]:
-        """Seconds of the recordings that fired each rule of a network, by joint; none without."""
+        """Seconds for which the recordings fired each rule of a network, by joint."""
         rules = self.model.schedule.fuzzy_rules()
         if rules is None:
             return []
         total: Tensor | float = 0.0
         for motion in self.motions:
-            # No sample counts for a gap.
+            # No sample extends over a gap.
             step = np.gradient(motion.time)
             step = torch.as_tensor(np.where(step > 10 * np.median(step), 0.0, step))
             total = total + rules.seconds(step, *map(torch.as_tensor, (motion.qd, motion.qdd)))
@@ -248,10 +248,10 @@ class FitResult:
         }
 
     def to_pandas(self) -> "pd.DataFrame":
-        """Table of coefficients and plant terms: value, low and high of 95 % intervals, note.
+        """Table of coefficients and plant terms: value, 95 % interval (low, high), note.
 
-        Coefficients are in SI and plant terms relative to the rig, as in `intervals`. Coefficients
-        that follow the motion are given where they apply, without intervals.
+        Coefficients are in SI units, plant terms relative to the rig, as in `intervals`.
+        Coefficients that follow the motion are listed by range of validity, without intervals.
         """
         import pandas as pd  # slow to import
 
@@ -300,7 +300,7 @@ class FitResult:
         return f"<p>{html.escape(self._head())}</p>{table}<ul>{warned}</ul>"
 
     def plot(self) -> "Figure":
-        """Coefficients with their intervals; over the velocity where they are fuzzy.
+        """Coefficients with their intervals; neuro-fuzzy ones over the velocity.
 
         Others that follow the motion are drawn over time along the first recording. A notebook
         shows the figure, `figure.savefig(path)` writes it.

@@ -1,7 +1,7 @@
 """Confidence intervals, unidentifiable parameters, warnings, and coefficients at any motion.
 
 Linear least-squares theory around the minimum, with two corrections: residuals are autocorrelated,
-so intervals use the effective sample size; parameters at a bound get no interval inside it.
+so intervals use the effective sample size; and intervals are clipped at the parameters' bounds.
 """
 
 import math
@@ -40,7 +40,7 @@ class Interval:
 
     @property
     def sd(self) -> float:
-        """Standard deviation, by the wider side: a bound cuts the other short."""
+        """Standard deviation from the wider side, because a bound may clip the other."""
         return max(self.high - self.value, self.value - self.low) / NORMAL_95
 
 
@@ -49,9 +49,9 @@ class Information:
     """Information about the shared variables, the others marginalised.
 
     Attributes:
-        data: curvature by the data, in units of one independent residual, (p, p).
+        data: curvature due to the data, in units of one independent residual, (p, p).
         prior: prior precision, (p,).
-        score: covariance of the data's gradient; None for homoscedastic residuals: equal to `data`.
+        score: covariance of the data's gradient; None if equal to `data` (homoscedastic residuals).
     """
 
     data: Tensor
@@ -69,13 +69,13 @@ def information(
 ) -> Information:
     """Marginalise all but the leading `shared` variables.
 
-    The result is zero, prior included, if round-off has taken that curvature: divergent windows
-    respond to their start by 1e15 times as much as to anything else.
+    The result is zero, including the prior, if round-off destroyed that curvature: divergent
+    windows are 1e15 times as sensitive to their start as to anything else.
 
     Args:
         hessian, precision: of the cost, prior included, (n, n), and of the prior, (n,).
         shared: number of variables to keep.
-        score: covariance of the gradient by the data, (n, n), where it is not the curvature:
+        score: covariance of the data's gradient, (n, n), if it differs from the curvature, as for
             heteroscedastic or autocorrelated residuals.
     """
     across = hessian[:shared, shared:]
@@ -104,12 +104,12 @@ def covariance_root(known: Information) -> Tensor:
     root = scale[:, None] * vectors * values.clamp(min=floor).rsqrt()
     if known.score is not None:
         pulled = root.T @ (known.score + torch.diag(known.prior)) @ root
-        # The score's part where the curvature all but vanishes is round-off.
+        # Where the curvature nearly vanishes, the score is round-off.
         weak = values <= torch.finfo(values.dtype).eps ** 0.5
         pulled = torch.where(weak | weak[:, None], torch.diag(weak.to(pulled)), pulled)
         sizes, turn = torch.linalg.eigh(_symmetric(pulled))
         root = root @ (turn * sizes.clamp(min=0).sqrt())
-    # Where the huge variance of a null direction dominates, no number is meaningful.
+    # No number is meaningful where the huge variance of a null direction dominates.
     null = (vectors.square() * (values <= 10 * floor)).sum(1) > 1e-12
     return torch.where(null[:, None], torch.inf, root)
 
@@ -155,7 +155,7 @@ def null_directions(
 def weakly_identified(
     names: Sequence[str], values: Tensor, known: Information, options: FitOptions = DEFAULTS
 ) -> tuple[str, ...]:
-    """Leading parameters of `known` whose interval includes zero as others compensate them."""
+    """Leading parameters of `known` whose interval includes zero because others compensate."""
     sd = standard_deviations(known)[: len(names)]
     conditional = known.data.diagonal()[: len(names)].clamp_min(1e-300).rsqrt()
     found = (NORMAL_95 * sd >= values.abs()) & (sd > options.conditional_ratio * conditional)
@@ -165,11 +165,11 @@ def weakly_identified(
 def exceeds_drive_torque(
     names: Sequence[str], sd: Tensor, slope: Tensor, need: Tensor
 ) -> tuple[str, ...]:
-    """Coefficients within whose intervals friction exceeds the torque that moves the joint.
+    """Coefficients so uncertain that their friction could exceed the torque of the joint.
 
-    A ratio to the value would not do: a coefficient near zero may be known to be small. `slope` is
-    that of the friction torque by each coefficient at its joint's peak speed, `need` the largest
-    torque.
+    The ratio of uncertainty to value would not do: a coefficient near zero may be known to be
+    small. `slope` is the derivative of the friction torque with respect to each coefficient at its
+    joint's peak speed, `need` the largest torque.
     """
     found = NORMAL_95 * sd * slope.abs() > need
     return tuple(names[i] for i in found.nonzero().flatten().tolist())
@@ -182,16 +182,16 @@ def warnings_of(
     unidentifiable: Sequence[str],
     at_zero: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Warnings about the end of a search, a sentence each.
+    """Warnings about the end of a search, one sentence each.
 
-    `at_zero` are those of `at_bounds` at the absence of an effect, which is a finding unless the
+    `at_zero` are those of `at_bounds` that mean absence of an effect, which is a finding unless the
     parameter is unidentifiable.
     """
     found = []
     if not converged:
         found.append("The search did not reach a minimum; the intervals may be too narrow.")
     if none := [name for name in at_zero if not any(name in d for d in unidentifiable)]:
-        found.append(f"At zero: {', '.join(none)}; the data show none.")
+        found.append(f"At zero: {', '.join(none)}; the data show no such effect.")
     if beyond := [name for name in at_bounds if name not in at_zero]:
         found.append(f"At a bound: {', '.join(beyond)}; the data favour values beyond it.")
     if unidentifiable:
@@ -229,16 +229,16 @@ def _symmetric(matrix: Tensor) -> Tensor:
     return 0.5 * (matrix + matrix.T)
 
 
-# Motions at which derivatives are multiplied out at a time; a network has many parameters.
+# Motions processed at a time, because the derivatives of a network have many columns.
 PIECE = 500
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CoefficientUncertainty:
-    """Posterior of a schedule's parameters, carried over to its coefficients.
+    """Posterior of a schedule's parameters, propagated to its coefficients.
 
-    Linear theory around the fitted parameters, with the plant's terms and the windows' states
-    free besides.
+    Linear theory around the fitted parameters, marginalised over the plant's terms and the windows'
+    states.
 
     Attributes:
         schedule: whose parameters these are.
@@ -253,7 +253,7 @@ class CoefficientUncertainty:
     def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Standard deviation of the coefficients at motions, (*batch, joint, coefficient).
 
-        Outside the trained range it is that at the range's edge: a network fades there, but not
+        Outside the trained range it is that at the range's edge: the network fades there, but not
         because it is known better. `qd` [rad/s] and `qdd` [rad/s^2] are (*batch, joint).
         """
         shape = qd.shape
@@ -265,7 +265,7 @@ class CoefficientUncertainty:
         """Standard deviation of a model's torque at velocities, (sample, joint).
 
         At the load at rest and without acceleration. `model` has this schedule; its `v_smooth` is
-        taken for known.
+        assumed to be known.
         """
         rest, load = torch.zeros_like(qd), load_at_rest(model.law, qd)
         with torch.enable_grad():
@@ -278,7 +278,7 @@ class CoefficientUncertainty:
             return torch.cat([self._sd(*piece) for piece in zip(*pieces, strict=True)])[..., 0]
 
     def _sd(self, qd: Tensor, qdd: Tensor, weights: Tensor | None = None) -> Tensor:
-        """That of each coefficient, or of their sum with weights, (sample, joint, 1)."""
+        """Standard deviation of each coefficient, or of their weighted sum, (sample, joint, 1)."""
         by = self.schedule.sensitivities(*self.schedule.within_range(qd, qdd))
         slopes, joint = by.parameters, by.joint
         unknown = torch.isinf(self.root).any(1)

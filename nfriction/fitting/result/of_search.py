@@ -38,12 +38,12 @@ from nfriction.plant import Plant
 from nfriction.signals import Motion
 
 BLURRED = (
-    "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
-    'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
+    "The torque comes from a smoothed motion, which blurs friction at low speed and ignores errors "
+    'of the plant; `method="output_error"` gives better estimates, and intervals that cover both.'
 )
-# Relative changes that agree within this share of them are alike.
+# Relative changes that agree within this fraction count as equal.
 ALIKE = 0.1
-# A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
+# Only the logarithm of a positive coefficient has a lower bound as small as this, in SI.
 NOTHING = 1e-9
 
 
@@ -54,7 +54,7 @@ def result_from_equation_error(
     motions: tuple[Motion, ...],
     torque: TorqueFit,
 ) -> FitResult:
-    """The result of a regression on torques, which is written into the model."""
+    """The result of a regression on torques; its coefficients are written into the model."""
     model.schedule.set_parameter_vector(torque.coefficients.reshape(-1))
     names = model.schedule.parameter_names(plant.joint_names)
     lower, upper = model.schedule.bounds()
@@ -103,9 +103,9 @@ def result_from_shooting(
     motions: tuple[Motion, ...],
     ambiguous: Sequence[str] = (),
 ) -> FitResult:
-    """The result of a search, whose end is written into the model.
+    """The result of a search; its coefficients are written into the model.
 
-    `ambiguous` are parameters for which quite other values explain the data as well.
+    `ambiguous` are parameters for which very different values explain the data equally well.
     """
     plant, variables, x = problem.jacobian.plant, problem.variables, result.x
     friction, vector, _, offsets = variables.split(x)
@@ -162,19 +162,19 @@ def result_from_shooting(
 
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """A sentence if all of a driven rig seems heavier or lighter alike: then torques are wrong."""
+    """A sentence if a whole driven rig seems heavier or lighter: then the torques are wrong."""
     found = list(_relative_weights(problem.jacobian.plant, intervals))
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
     scale = sum(found) / len(found)
-    # One of them alone may be off by so much; their common share is what a torque's scale moves.
+    # A single term may be off by that much; the scale of a torque changes all of them.
     alike = all(abs(x - scale) < ALIKE * abs(scale) for x in found)
     if not alike or abs(scale) < problem.options.gain_term[1]:
         return ()
     return (
-        f"Inertia and gravity are {1 + scale:.3g} times those of the rig alike, as if torques were "
+        f"Inertia and gravity are both {1 + scale:.3g} times those of the rig, as if torques were "
         f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
-        "friction is, too.",
+        "friction is also too large.",
     )
 
 
@@ -186,23 +186,23 @@ def offset_warnings(
     terms = {t.name: t for t in problem.variables.terms if "torque_offset" in t.change}
     for one in intervals:
         term = terms.get(one.name)
-        # Within its prior an offset is a bias like any other.
+        # An offset within its prior is an ordinary bias.
         if term and abs(one.value) > term.prior_sd and one.low * one.high > 0:
             j = int(term.change["torque_offset"].argmax())
             whole = float(plant.torque_offset[j])
             way = "backwards" if whole > 0 else "forwards"
             yield (
                 f"The fitted plant has a constant drive torque of {whole:.3g} {force} at "
-                f"{plant.joint_names[j]}, which may as well be friction that is "
-                f"{2 * abs(whole):.3g} {force} larger {way}. The friction model and its exports "
-                f"lack it: add {-whole:.3g} {force} to a command."
+                f"{plant.joint_names[j]}, which may equally be friction that is "
+                f"{2 * abs(whole):.3g} {force} larger {way}. The friction model and its exports do "
+                f"not include it: add {-whole:.3g} {force} to a command."
             )
 
 
 def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:
-    """Relative changes of each link's gravity and inertia, 0 where it may be none.
+    """Relative changes of each link's gravity and inertia, 0 if not significant.
 
-    Link and rotor of a geared joint count as one, since the data show their sum alone.
+    Link and rotor of a geared joint count as one, since the data show only their sum.
     """
     terms, own = {i.name: i for i in intervals}, dict(plant.named_buffers())
     for k in range(plant.joints - plant.first_link):
@@ -219,7 +219,7 @@ def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[f
 
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
-    """Samples that a robust loss counts less than half, by recording."""
+    """Samples to which a robust loss gives less than half weight, by recording."""
     if problem.loss.name == "linear":
         return
     windows = problem.windows
@@ -242,7 +242,7 @@ def _identifiability(
 ) -> tuple[tuple[Interval, ...], tuple[str, ...], Tensor | None]:
     """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
-    Of a network only its plant terms have intervals, and no parameter counts as unidentifiable.
+    With a network only plant terms have intervals, and no parameter counts as unidentifiable.
     """
     constant = not problem.friction.schedule.follows_motion
     if (belief := problem.friction.schedule.belief()) is None:
@@ -254,11 +254,11 @@ def _identifiability(
     lower, upper = (bound[:count] for bound in variables.bounds())
     fitted = (lower < upper).nonzero().flatten()
     fitted_names = [names[i] for i in fitted.tolist()]
-    # Residuals of exactly zero are those of joints that never moved.
+    # Residuals are exactly zero if no joint ever moved.
     if not torch.isfinite(result.hessian).all() or not effective_noise(residuals) > 0:
         return (), tuple(fitted_names) if constant else (), None
     sd = hac_sd(residuals, bandwidth(problem.windows.q, options), options)
-    # A contact below breakaway returns to its places, and the rounding there with it, at any lag.
+    # Below breakaway a contact returns to the same positions, so the rounding recurs at any lag.
     quantum = encoder_count(problem) if problem.friction.law.memory else None
     rms = float(residuals.square().mean().sqrt())
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
@@ -293,10 +293,10 @@ def _by_data(
 ) -> tuple[ShootingProblem, Tensor]:
     """A network's problem with hardly any prior, and the step from `x` to its minimum.
 
-    Priors that evidence or hold-out chose keep a network near its law, also where the truth is not,
-    and its search ends in a narrow valley before the minimum. Its intervals are those of a prior of
-    one unit and without that on unvisited motion: where priors alone hold a network, the data do
-    not. The step is a further error.
+    Priors chosen by evidence or hold-out keep a network near its law even where the truth is not,
+    and its search ends in a narrow valley before the minimum. Its intervals are computed with a
+    prior of one unit and without that on unvisited motion, so that they rest on the data and not on
+    priors. The step counts as a further error.
     """
     mean, sd = problem.friction_prior or belief
     wide = torch.maximum(sd, belief[1])
@@ -314,14 +314,14 @@ def _by_data(
 def _torque_scale(
     problem: ShootingProblem, result: LeastSquaresResult, motions: Sequence[Motion]
 ) -> tuple[Tensor, Tensor]:
-    """Largest |derivative| of the friction torque by each constant coefficient at its joint's peak
-    speed, and the largest torque that moves this joint, (friction parameter,) each.
+    """Largest |derivative| of the friction torque with respect to each constant coefficient at its
+    joint's peak speed, and the largest torque that moves this joint, (friction parameter,) each.
     """
     friction, vector, _, _ = problem.variables.split(result.x)
     speed, moved = peak_dynamics_torque(problem.plant_at(vector), motions, problem.options)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
-    # A gear's loss is a share of the torque, which drives the joint or holds it back.
+    # A gear's loss is a share of the torque, which may drive the joint or brake it.
     loads = (need, -need) if problem.friction.law.reads_drive else (torch.ones_like(speed),)
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.

@@ -11,7 +11,7 @@ from nfriction.fitting.options import DEFAULTS
 def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance) -> bool:
     """True if squared errors on windows (window,) fell by more than their scatter would by chance.
 
-    By Student's distribution, as windows may be few.
+    Uses Student's distribution, because there may be few windows.
     """
     if not old.isfinite().all():
         return bool(new.isfinite().all())
@@ -22,8 +22,8 @@ def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance) -> boo
 def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
     """Log of the ratio of two sums over windows (window,), and its standard deviation.
 
-    By the jackknife over the windows, as residuals are correlated within and not across them;
-    infinite of a single one.
+    Jackknife over the windows, because residuals are correlated within and not across them;
+    infinite for a single window.
 
     References:
         B. Efron, C. Stein, Annals of Statistics 9 (1981), 586-596.

@@ -1,4 +1,4 @@
-"""Noise of signals, and autocorrelation of residuals: how many independent ones they count for."""
+"""Noise of signals, and autocorrelation of residuals: the effective number of samples."""
 
 import math
 
@@ -16,7 +16,7 @@ NORMAL_MEDIAN = 0.674490
 def correlation_time(residuals: Tensor) -> float:
     """Integrated autocorrelation time of residuals (window, sample, joint) in samples, 1 or more.
 
-    n residuals weigh like n over this time.
+    n residuals carry as much information as n over this time independent ones.
     """
     centred = residuals - residuals.mean(1, keepdim=True)
     return float(_integrated(_autocovariance(centred).sum((0, 2))[None, :, None]))
@@ -25,8 +25,8 @@ def correlation_time(residuals: Tensor) -> float:
 def white_noise(values: Tensor) -> Tensor:
     """Standard deviation of the noise in signals (window, sample, joint) by joint, (joint,).
 
-    By the median of third differences, which neither steps nor jumps of the signal's slope raise;
-    zero of a signal that is held over several samples.
+    From the median of third differences, which steps and kinks of the signal do not raise; zero for
+    a signal that is held over several samples.
     """
     if values.shape[1] < 4:
         return torch.zeros_like(values[0, 0])
@@ -52,9 +52,9 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
     """Heteroscedasticity- and autocorrelation-consistent sd of each residual.
 
     The noise level is the residuals' peak spectral density within the motion's bandwidth, which
-    bounds the variance of their sum times a sensitivity of that bandwidth. It is estimated stretch
-    by stretch: quantisation error is white while a joint moves and constant while it is nearly at
-    rest. Errors that occur again later, as rounding does in a periodic motion, count once.
+    bounds the variance of their sum times a sensitivity of that bandwidth. It is estimated segment
+    by segment: quantisation error is white while a joint moves and constant while it is nearly at
+    rest. Errors that recur later, such as rounding in a periodic motion, count once.
 
     Args:
         residuals: [rad; m], shape (window, sample, joint), like the result.
@@ -68,7 +68,7 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
     length = max(options.stationary_times * correlation_time(residuals), options.min_stationary)
     stretches = residuals.tensor_split(max(1, int(samples / length)), 1)
     power = torch.stack([part.square().mean(1) for part in stretches])
-    # A stretch without error owes that to its window's free start, which is off by as much.
+    # A segment has no error if its window's free initial state absorbed it.
     power = torch.maximum(power, power.flatten(0, 1).median(0).values)
     density = torch.stack(
         [_max_spectral_density(_autocovariance(part), band, options) for part in stretches]
@@ -81,10 +81,10 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
 
 
 def repetition(residuals: Tensor, length: int) -> Tensor:
-    """Number of times that errors (window, sample, joint) in order of time occur, (joint,).
+    """Number of times that errors (window, sample, joint) in order of time recur, (joint,).
 
-    By their autocorrelation at lags of more than `length` samples, where it exceeds what errors
-    that last no longer than a window reach by chance at one of all lags.
+    From their autocorrelation at lags of more than `length` samples, if it exceeds the level that
+    errors which last no longer than a window reach by chance at one of all lags.
 
     References:
         M. S. Bartlett, J. Royal Statistical Society Suppl. 8 (1946), 27-41 (variance at a lag).
@@ -102,7 +102,7 @@ def repetition(residuals: Tensor, length: int) -> Tensor:
 
 
 def decimation(residuals: Tensor, options: FitOptions = DEFAULTS) -> int:
-    """Samples per counted one that residuals (window, sample, joint) of such correlation allow."""
+    """Decimation that the correlation of residuals (window, sample, joint) allows."""
     found = correlation_time(residuals) / options.samples_per_correlation
     return int(min(max(found, 1), options.max_decimation))
 
@@ -115,7 +115,7 @@ def _autocovariance(residuals: Tensor) -> Tensor:
 
 
 def _correlation(covariance: Tensor) -> Tensor:
-    """Autocorrelation, (window, lag, joint); 1 everywhere where there is no error."""
+    """Autocorrelation, (window, lag, joint); 1 at all lags if there is no error."""
     none = covariance[:, :1] <= 0
     return torch.where(none, 1.0, covariance / covariance[:, :1].clamp_min(1e-300))
 

@@ -1,10 +1,10 @@
-"""Normal equations of windows that share variables and have own ones (states, offsets).
+"""Normal equations of windows with shared variables and their own ones (states, offsets).
 
 For intervals, the windows' states are marginalised on the rows of the Jacobian instead of on J^T J.
-The end of a chaotic motion moves by 1e10 times as much as its start. In J^T J the growth of these
-columns swamps all other information; QR of J keeps it. Each window's rows are triangularised by
-its state's columns, piece by piece; the rows below the triangle depend neither on the state nor on
-its growth, so their squares may be summed.
+The end of a chaotic motion is 1e10 times as sensitive as its start. In J^T J the growth of these
+columns swamps all other information; QR of J keeps it. Each window's rows are triangularised with
+respect to its state's columns, piece by piece; the rows below the triangle depend neither on the
+state nor on its growth, so their squares may be summed.
 
 References:
     G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), ch. 5.
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 # Rows of the Jacobian at some samples of all windows: these samples, and derivatives of the scaled
-# errors, (window, row, column), by the shared variables, then each window's own
+# errors, (window, row, column), with respect to the shared variables and then each window's own
 # (`DecisionVariables.indices`).
 Rows = tuple[slice, Tensor]
 
@@ -32,7 +32,7 @@ def scaled_rows(
     joints, shared, own = len(measurement), int(indices[0, 0]), indices.shape[1]
     for part, rows in pieces:
         if shared + own > rows.shape[-1]:
-            # An encoder offset moves the initial position and the measured ones.
+            # An encoder offset shifts both the initial position and the measured ones.
             measured = torch.eye(joints, dtype=torch.float64)
             rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
         scaled = (measurement @ rows) * scale[:, part, :, None]
@@ -66,8 +66,8 @@ def normal_equations(
     return gradient, hessian
 
 
-# Information below so many roundings of a row is discarded; motions that grow by 1e20 leave
-# nothing else.
+# Information below this many round-off units of a row is discarded; motions that grow by 1e20
+# contain nothing else.
 ROUNDOFF_UNITS = 30.0
 
 
@@ -104,7 +104,7 @@ class Kept:
         return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)
 
     def by_states(self, response: Tensor, precision: Tensor) -> Tensor:
-        """Covariance of the gradient by the prior of the states alone, (kept, kept)."""
+        """Covariance of the gradient due to the prior of the states alone, (kept, kept)."""
         return self.squares(precision.sqrt()[..., None] * response)
 
     def sums(self, rows: Tensor, errors: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ class Kept:
         return self.size - len(self.indices) * self.state
 
     def _places(self) -> Tensor:
-        """Place of each window's columns among the variables that remain, (window, column)."""
+        """Index of each window's columns among the remaining variables, (window, column)."""
         states, common = self.size - self.count, torch.arange(self.shared)
         offsets = self.indices[:, self.state :] - states
         return torch.cat([common.expand(len(offsets), -1), offsets], 1)
@@ -130,20 +130,20 @@ def marginalize_states(
     """Marginalise the windows' states by a square-root information filter.
 
     Args:
-        rows: of the Jacobian, in the order of time.
+        rows: of the Jacobian, in order of time.
         kept: the remaining variables.
         precision: of the states' prior, (window, state).
 
     Returns:
-        Curvature above round-off over the remaining variables, (kept, kept), and the derivatives of
-        each window's state by its columns of these, (window, state, column).
+        Curvature above round-off in the remaining variables, (kept, kept), and the derivatives of
+        each window's state with respect to its columns of these, (window, state, column).
     """
     windows, state = precision.shape
     columns = kept.shared + kept.indices.shape[1] - state
     triangle = precision.sqrt().diag_embed()
     right = torch.zeros(windows, state, columns, dtype=torch.float64)
     data = kept.squares(right)
-    # Sums of squares of all rows, by the state and by the remaining variables.
+    # Sums of squares of all rows, for the state and for the remaining variables.
     sizes = torch.zeros_like(precision), torch.zeros_like(right[:, 0])
     for _, scaled in rows:
         own, others = kept.split(scaled)
@@ -163,7 +163,7 @@ def marginalize_states(
 def score_covariance(
     rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor
 ) -> Tensor:
-    """Covariance of the gradient, (kept, kept), by rows scaled to their own residuals."""
+    """Covariance of the gradient, (kept, kept), from rows scaled to their own residuals."""
     total = kept.by_states(response, precision)
     for _, scaled in rows:
         own, others = kept.split(scaled)
@@ -172,7 +172,7 @@ def score_covariance(
 
 
 def drawn_score(rows: Iterable[Rows], kept: Kept, response: Tensor, errors: Tensor) -> Tensor:
-    """The part of it by drawn errors (window, sample, joint, draw), scaled like the rows."""
+    """Covariance of the gradient from drawn errors (window, sample, joint, draw), scaled alike."""
     sums = torch.zeros(kept.count, errors.shape[-1], dtype=torch.float64)
     for part, scaled in rows:
         own, others = kept.split(scaled)
@@ -185,8 +185,8 @@ def rounding_of(
 ) -> Tensor:
     """Rounding of windows (window, sample, joint) by encoders with any zero, (*, draw).
 
-    Each recording (see `Windows.spans`) has a zero. Positions to which a joint returns are rounded
-    alike, at any time later.
+    Each recording (see `Windows.spans`) has a zero. A position to which a joint returns is rounded
+    in the same way, at any later time.
     """
     random = torch.Generator().manual_seed(0)
     shape = (1 + max(place for place, *_ in spans), 1, q.shape[-1], draws)
@@ -217,7 +217,7 @@ def _discard_roundoff(data: Tensor, sizes: Tensor) -> Tensor:
 
 
 def _triangularise(own: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate rows so that `own` is a triangle above zeros: it, and the others beside both."""
+    """Rotate rows so that `own` is a triangle above zeros: the triangle, others above and below."""
     reflections, factors = torch.geqrf(own)
     turned = torch.ormqr(reflections, factors, others, left=True, transpose=True)
     top, free = turned.tensor_split([own.shape[-1]], -2)

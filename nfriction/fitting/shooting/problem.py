@@ -1,14 +1,14 @@
 """Output error by multiple shooting: a cost and its Gauss-Newton model.
 
-A recording is cut into windows. Each is simulated from a state of its own, because the motion of a
-light mechanism forgets its start within seconds; of a law with memory the deflections are part of
-that state. The decision variables x are the friction parameters, the plant terms, each window's
+A recording is cut into windows. Each is simulated from its own initial state, because the motion of
+a light mechanism forgets its start within seconds; for a law with memory the deflections are part
+of that state. The decision variables x are the friction parameters, the plant terms, each window's
 initial state and the encoders' offsets, and the cost is
 
     J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      samples (or a robust loss)
          + 1/2 sum (x - mean)^2 / sd^2                          priors
 
-with C the matrix from joint to recorded coordinates. Plant and friction model stay as they are. The
+with C the matrix from joint to recorded coordinates. Plant and friction model stay unchanged. The
 next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
 
 References:
@@ -45,13 +45,13 @@ class ShootingProblem:
 
     Args:
         jacobian: derivatives of a step; has the plant and its adjustable terms.
-        friction: the friction model at the start, which a search leaves as it is.
-        windows: what was measured.
+        friction: the friction model at the start, which a search leaves unchanged.
+        windows: of measured motion.
         noise_sd: standard deviation of a position error [rad; m], scale of the priors.
         measurement: matrix (joint, joint) from joint to recorded coordinates, where errors count.
         substeps: integration steps per sample.
-        stride: every so many samples one counts, with that weight: model errors last far longer
-            than a sample, and sums over many parameters dominate the time of a step.
+        stride: decimation: one in `stride` samples counts, with that weight, because model errors
+            last far longer than a sample and sums over many parameters dominate the time of a step.
         friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
         loss: of the errors.
@@ -108,7 +108,7 @@ class ShootingProblem:
         return self.deviation(x, self.simulate(x)) * self.windows.weight[..., None]
 
     def counted_errors(self, x: Tensor) -> Tensor:
-        """Errors whose squares are what the loss counts; `errors` where it is the square."""
+        """Errors whose squares give the loss; equal to `errors` for least squares."""
         return self.loss.counted(self.errors(x))
 
     def rescaled(self, x: Tensor) -> "ShootingProblem":
@@ -130,7 +130,7 @@ class ShootingProblem:
         run, offsets = self.simulate(x).motion, self.variables.window_offsets(x)
         run = replace(run, q=run.q - offsets[:, None])
         states = [(m.q.copy(), m.qd.copy()) for m in motions]
-        # A sample that two windows share is taken from the later one's fitted start.
+        # A sample shared by two windows is taken from the fitted start of the later one.
         for w, (place, first, last) in enumerate(self.windows.spans):
             n = self.substeps * (last - first) + 1
             for kept, found in zip(states[place], (run.q, run.qd), strict=True):
@@ -146,11 +146,11 @@ class ShootingProblem:
 
     @cached_property
     def _moving(self) -> FrictionModel:
-        """A copy of the friction model, which every simulation moves to its parameters."""
+        """A copy of the friction model, which every simulation sets to its parameters."""
         return substepped(self.friction, self.substeps)
 
     def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`, valid until the next call; memory only for derivatives."""
+        """The windows' motion at `x`, valid until the next call; derivatives need its memory."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
         model.schedule.set_parameter_vector(friction)
@@ -168,7 +168,7 @@ class ShootingProblem:
         return Trajectory(model, plant, motion, linearised, step, memory, law_slope)
 
     def _torques(self, plant: Tensor) -> tuple[Tensor, Tensor]:
-        """Torque over each step, and as `StepJacobian` takes it."""
+        """Torque over each step, and in the form that `StepJacobian` takes."""
         k = self.jacobian.delay_index
         if k is None:
             return self.windows.tau, self.windows.tau
@@ -179,7 +179,7 @@ class ShootingProblem:
         return integrate(plant, model, inputs)
 
     def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
-        """Simulated less measured position in recorded coordinates, (window, step + 1, joint)."""
+        """Simulated minus measured position in recorded coordinates, (window, step + 1, joint)."""
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 

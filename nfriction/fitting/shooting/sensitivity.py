@@ -1,10 +1,10 @@
 """Exact sensitivities of simulated windows.
 
-A window's motion is a chain of identical step maps. All of them are linearised in one kernel call
-by a few directions (state, held coefficients, plant terms); steps between counted samples are
-chained in these directions; a recursion of small matrix products then carries the sensitivities
-through time. The state includes that of a law with memory. The cost hardly depends on the number of
-friction parameters, so constant and neuro-fuzzy models are fitted alike.
+A window's motion is a chain of identical step maps. One kernel call linearises all of them in a few
+directions (state, held coefficients, plant terms); steps between counted samples are chained in
+these directions; a recursion of small matrix products then carries the sensitivities through time.
+The state includes that of a law with memory. The cost hardly depends on the number of friction
+parameters, so constant and neuro-fuzzy models are fitted in the same way.
 """
 
 import logging
@@ -27,7 +27,7 @@ from nfriction.simulation.rk4 import rk4_step
 
 logger = logging.getLogger(__name__)
 
-# Samples linearised together in eager torch, which should stay in the processor's cache.
+# Samples linearised together in eager torch, few enough for the processor's cache.
 CHUNK = 1024
 # Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
 # products, few enough for the processor's cache.
@@ -35,9 +35,9 @@ PIECE = 2000
 
 
 class StepJacobian:
-    """Exact derivatives of one step by state, held coefficients and plant terms.
+    """Exact derivatives of one step with respect to state, held coefficients and plant terms.
 
-    Compiled where it can be (100 times faster), otherwise by eager dual numbers.
+    Compiled if possible (100 times faster), otherwise with eager dual numbers.
 
     Args:
         plant: the mechanism as given.
@@ -48,11 +48,11 @@ class StepJacobian:
         after_step: derivatives (sample, row, direction) of the state (q, qd, that of a law with
             memory) and the acceleration after a step, as a function of state, held coefficients,
             torque, step and plant terms. Directions: state, held coefficients (joint-major), plant
-            terms. Where the torque's delay is one of the terms, the torque is that at no delay,
-            then its slope over the delay.
+            terms. If the torque's delay is one of the terms, the torque consists of that at zero
+            delay and its slope over the delay.
         initial_acceleration: derivatives (window, joint, direction) of the first acceleration,
-            which has no friction, by q, qd and plant terms, as a function of q, qd, torque (window,
-            joint) and plant terms.
+            which has no friction, with respect to q, qd and plant terms, as a function of q, qd,
+            torque (window, joint) and plant terms.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class StepJacobian:
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
         )
         if friction.law.memory:
-            # A stiff contact would magnify the rounding that compiled code is checked against.
+            # A stiff contact would magnify round-off, against which compiled code is checked.
             held = 0.5 + 50.0 * held
         state = torch.cat([q, qd, 1e-3 * held.new_ones(joints * friction.law.state_size)])
         self.after_step = _jacobian(self._step, [state, held, tau, step, vector], (0, 1, 4))
@@ -103,11 +103,11 @@ class StepJacobian:
 def _jacobian(
     function: Callable[..., Tensor], example: Sequence[Tensor], by: tuple[int, ...]
 ) -> Callable[..., Tensor]:
-    """The Jacobian of a function by some inputs, over batches of all of them but the last."""
+    """The Jacobian of a function in some inputs, over batches of all inputs except the last."""
     try:
         compiled = codegen.CompiledFunction(function, example, jacobian=by)
     except codegen.CodegenError as error:
-        logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
+        logger.warning("fits run slowly: steps are linearised in eager torch (%s)", error)
         axes = (*[0] * (len(example) - 1), None)
         slopes = torch.func.vmap(torch.func.jacfwd(function, by), axes, chunk_size=CHUNK)
         return lambda *given: torch.cat([slope.flatten(2) for slope in slopes(*given)], -1)
@@ -121,7 +121,7 @@ class Trajectory:
     `motion` is (window, step + 1, joint), `tau` (window, step, any) as `StepJacobian` takes it,
     `step` (window, step). The `memory` of the coefficients (window, step, joint, state_size) is
     held constant in derivatives. `law_slope` are derivatives of the first state of a law with
-    memory, by the friction parameters and by its variables, (window, joint state, column).
+    memory with respect to friction parameters and its variables, (window, joint state, column).
     """
 
     friction: FrictionModel
@@ -152,8 +152,9 @@ def propagate(
         stride: samples per counted one.
 
     Yields:
-        Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
-        the window's initial state. The last piece is the windows' last sample, counted or not.
+        Samples, and (window, sample, joint, column) with respect to friction parameters, plant
+        terms and the window's initial state. The last piece is the windows' last sample, counted or
+        not.
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
@@ -176,7 +177,7 @@ def propagate(
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
-    # Steps after the last whole block are a shorter block of their own.
+    # Steps after the last whole block form a shorter block.
     for first, last in pairwise(sorted({*range(0, whole, many), whole, steps})):
         length = min(block, last - first)
         before, qd, qdd, tau, step = (
@@ -220,7 +221,7 @@ def _compose(
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    The results are derivatives of the ends of blocks by the state before, and by what is shared.
+    Returns derivatives of the ends of blocks with respect to the state before and shared variables.
     """
     samples, joints, k = slope.qd.shape
     own = derivative.shape[-2] - joints
@@ -252,9 +253,9 @@ def _compose(
 def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Carry derivatives of a state (window, row, column) through maps (map, window, row, column).
 
-    The results are the first `count` rows before every map, and all rows after the last.
+    Returns the first `count` rows before every map, and all rows after the last.
     """
-    # Thousands of products of small matrices: NumPy's overhead is a fifth of torch's.
+    # For thousands of products of small matrices NumPy's overhead is a fifth of torch's.
     state, shared = by_state.numpy(), by_shared.numpy()
     before = start.numpy().copy()
     after = np.empty_like(before)

@@ -1,9 +1,9 @@
 """Noise of encoders and torques, and the information that windows give despite it.
 
-A right law on a right plant leaves the encoder's rounding, and the motion by which a simulation
-with the recorded torque departs from the true one. The noise of the torque is that part of the
-record which changes from sample to sample; its effect is found by simulation. Noise that lasts for
-many samples is not counted, since it looks like an error of the law.
+The residuals of a correct law on a correct plant are the encoder's rounding, and the deviation from
+the true motion that noise in the recorded torque causes in a simulation. That noise is the part of
+the record that changes from sample to sample; its effect is found by simulation. Noise that lasts
+for many samples is not included, since it looks like an error of the law.
 """
 
 import math
@@ -32,21 +32,21 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.inputs import is_heated
 from nfriction.optim.least_squares import LeastSquaresResult
 
-# Counts of a coarse encoder that is still in use.
+# Counts per turn of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
-# Share of a noise at which simulations respond linearly to it.
+# Fraction of the noise at which simulations respond linearly.
 SMALL = 1e-3
 # Realisations of the torque's noise for intervals.
 DRAWS = 30
-# Steps of an integration whose error no longer matters, to one of the fit's.
+# Steps per step of the fit with which the integration error no longer matters.
 FINER = 4
 
 
 def rounding(problem: ShootingProblem) -> float:
-    """Root mean square rounding of the encoders [rad; m], by their count.
+    """Root mean square rounding of the encoders [rad; m], from their count.
 
-    A count that neither the plant states nor the positions show is taken for a 4096th of the motion
-    within a window.
+    A count that neither the plant states nor the positions show is taken to be a 4096th of the
+    motion within a window.
     """
     count = encoder_count(problem)
     if not count:
@@ -71,10 +71,10 @@ def explained(problem: ShootingProblem, x: Tensor, rms: float) -> bool:
 def measurement_noise(
     problem: ShootingProblem, x: Tensor, residual: float, enough: float | None = None
 ) -> float:
-    """Residual of a right law [rad; m], given that of a solution, both root mean square.
+    """Residual of a correct law [rad; m], given that of a solution, both root mean square.
 
-    The torque's noise is simulated only for residuals of more than `enough` times the rounding, by
-    default those that count as errors of the model.
+    The torque's noise is simulated only if the residual exceeds `enough` times the rounding, by
+    default the limit above which it counts as model error.
     """
     least = rounding(problem)
     if residual <= (enough or problem.options.model_error_ratio) * least:
@@ -87,7 +87,7 @@ def measurement_noise(
 
 
 def _once_fitted(problem: ShootingProblem, x: Tensor, response: Tensor) -> float:
-    """Root mean square of errors (window, sample, joint) that a fit to them leaves [rad; m]."""
+    """Root mean square of errors (window, sample, joint) that remains after a fit [rad; m]."""
     variables, off = problem.variables, response * problem.scale
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
@@ -121,8 +121,8 @@ def gathered_information(
 
     `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
     rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
-    Errors by the torque's noise are added: they last longer than a window, whose own start
-    hides most of them, so residuals show too little of their autocorrelation.
+    Errors due to the torque's noise are added: they last longer than a window, whose free initial
+    state absorbs most of them, so that residuals show too little of their autocorrelation.
     """
     variables, run = problem.variables, problem.simulate(x, with_memory=True)
     shared, (precision, _) = variables.shared_count, variables.prior()
@@ -137,7 +137,7 @@ def gathered_information(
         score = kept.by_states(response, of_states)
         score += drawn_score(problem.rows(run, scale), kept, response, drawn)
     else:
-        # Residuals hold what is drawn besides.
+        # The residuals already contain the errors that are drawn.
         share = 1.0 if by_torque is None else _beside_torque(problem, x, by_torque[..., 0])
         rows = problem.rows(run, problem.scale * share * sd / problem.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
@@ -151,11 +151,11 @@ def gathered_information(
 def torque_response(
     problem: ShootingProblem, x: Tensor, draws: int, seed: int = 0
 ) -> Tensor | None:
-    """Position errors by the noise of the recorded torques, (window, sample, joint, draw).
+    """Position errors due to noise in the recorded torques, (window, sample, joint, draw).
 
-    The noise is that part of a torque which changes from sample to sample, see `white_noise`;
-    None without any, or without the recordings. A torque that is off moves all samples after it,
-    so these errors last. Draws whose simulation diverges are left out.
+    The noise is the part of a torque that changes from sample to sample, see `white_noise`; None
+    without noise or recordings. An error in a torque changes all later samples, so these errors
+    persist. Draws whose simulation diverges are left out.
     """
     sd = white_noise(problem.windows.tau).numpy()
     if not (problem.windows.recordings and sd.any()):
@@ -175,14 +175,14 @@ def torque_response(
 
 
 def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> Tensor:
-    """Change of the minimum by simulations of finer steps, to first order, like `result.x`.
+    """Change of the minimum if simulations had finer steps, to first order, like `result.x`.
 
-    Where friction changes its sign within a step, an integration errs by less than an encoder's
-    count; but it errs alike each time, which no average over samples takes out.
+    If friction changes sign within a step, the integration error is less than an encoder count, but
+    it is the same each time, so that averaging over samples does not remove it.
     """
     variables, x = problem.variables, result.x
     if problem.friction.schedule.state_size and not is_heated(problem.friction.law):
-        # Its memory advances with every step, and would run ahead in finer ones.
+        # Its hidden state advances with every step, and would run ahead in finer ones.
         return torch.zeros_like(x)
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()

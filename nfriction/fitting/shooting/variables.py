@@ -32,10 +32,10 @@ def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
 
 
 def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """State of a law with memory, (window, joint, state), by shares of that of a slipping contact.
+    """State of a law with memory, (window, joint, state), from shares of a slipping contact's.
 
-    By these shares the torque at the start is the same at any stiffness. The other result is the
-    state's derivatives by all coefficients and shares, (window, joint state, column).
+    With such shares the initial torque is the same at any stiffness. The second result contains the
+    state's derivatives with respect to all coefficients and shares, (window, joint state, column).
     """
     memory = model.law.memory
     if memory is None:
@@ -65,10 +65,10 @@ def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tens
 
 
 class Parts(NamedTuple):
-    """A vector of decision variables, taken apart.
+    """The parts of a vector of decision variables.
 
-    `friction` and `plant` are parameter vectors, `states` position and velocity at the start of
-    each window, and `Windows.law_state`, (window, any), `offsets` those of the encoders,
+    `friction` and `plant` are parameter vectors; `states` are position and velocity at the start of
+    each window, and `Windows.law_state`, (window, any); `offsets` are those of the encoders,
     (recording, joint) or no rows.
     """
 
@@ -85,12 +85,12 @@ class DecisionVariables:
     The shared variables, those of all windows, come first.
 
     Args:
-        schedule: its parameters are the start, and the values of what is not fitted.
+        schedule: its parameters are the start, and the values of parameters that are not fitted.
         terms: adjustable terms of the plant.
-        windows: what was measured.
+        windows: of measured motion.
         friction_prior, plant_prior: mean and standard deviation; default those of schedule and
             terms.
-        offset_sd: of the encoder offsets, (recording, joint) [rad; m]; None seeks no offsets.
+        offset_sd: of the encoder offsets, (recording, joint) [rad; m]; None for no offsets.
         options: priors of the initial states.
     """
 
@@ -125,7 +125,7 @@ class DecisionVariables:
         offsets: Tensor | None = None,
         friction: Tensor | None = None,
     ) -> Tensor:
-        """Vector at the smoothed initial states; by default the other parts are as given."""
+        """Vector at the smoothed initial states; the other parts by default unchanged."""
         friction = self.schedule.parameter_vector() if friction is None else friction
         zeros = torch.zeros(len(self.terms) + self.offset_count, dtype=torch.float64)
         plant = zeros[: len(self.terms)] if plant is None else plant
@@ -146,7 +146,7 @@ class DecisionVariables:
         return offsets[self._recording()] if len(offsets) else torch.zeros_like(self.windows.q0)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper bounds; equal where nothing is fitted."""
+        """Lower and upper bounds; equal for variables that are not fitted."""
         lower, upper = self.schedule.bounds()
         own = len(self.windows) * self.state_count + self.offset_count
         free = torch.full((own,), torch.inf, dtype=torch.float64)
@@ -165,7 +165,7 @@ class DecisionVariables:
         return sd.square().reciprocal(), mean
 
     def indices(self) -> Tensor:
-        """Places of each window's own variables, its state and its offsets, (window, any)."""
+        """Indices of each window's own variables, its state and its offsets, (window, any)."""
         states = torch.arange(len(self.windows) * self.state_count).reshape(len(self.windows), -1)
         states = states + self.shared_count
         if not self.offset_count:

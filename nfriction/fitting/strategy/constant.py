@@ -1,6 +1,6 @@
 """Constant coefficients: regression on torques first, then shooting windows of growing length.
 
-A nonlinear law has several starts: its own, and two from the law that it contains.
+A nonlinear law has several starts: its own, and two from its nested law.
 """
 
 import math
@@ -59,7 +59,7 @@ SKIPPED = {
 
 
 def fit_constant(task: FitTask) -> FitResult:
-    """Fit constant coefficients, by torques and then by simulated windows."""
+    """Fit constant coefficients to torques and then to simulated windows."""
     model, options, start = task.model, task.options, task.start
     begun = start.plant if start else task.plant
     torque = regression(task, model, begun)
@@ -73,7 +73,7 @@ def fit_constant(task: FitTask) -> FitResult:
     def with_presliding(sliding: Tensor, rig: Plant) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        # Rows of a contact that yields would be taken for sliding, at a smaller friction.
+        # Samples of a contact that yields would be mistaken for sliding with less friction.
         apart = regression(task, model, rig, TRAVELLED).coefficients
         return presliding_starts(fitter, sliding, apart, plant, task.motions)
 
@@ -86,7 +86,7 @@ def fit_constant(task: FitTask) -> FitResult:
         fitter, friction, plant, task.motions,
         None if linear else equation_error,
     )  # fmt: skip
-    # A law with a curved term may end in a local minimum that its nested law does not have.
+    # A nonlinear law may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
@@ -152,7 +152,7 @@ def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[
 
 
 def constant_start(task: FitTask) -> FitResult:
-    """The constant fit of a model's law; `task.start` if it is one of the same recordings."""
+    """The constant fit of a model's law; `task.start` if it is one to the same recordings."""
     model, start = task.model, task.start
     if is_constant_fit(start, model) and _offsets_match(start, task):
         return start
@@ -161,7 +161,7 @@ def constant_start(task: FitTask) -> FitResult:
 
 
 def _offsets_match(start: FitResult, task: FitTask) -> bool:
-    """True if a fit has encoder offsets of just these recordings, or rightly none."""
+    """True if a fit has encoder offsets of exactly these recordings, or correctly none."""
     if not task.per_recording:
         return not start.encoder_offsets
     pairs = zip(start.motions, task.motions, strict=False)
@@ -177,7 +177,7 @@ def warm_start_from_nested(
     motions: tuple[Motion, ...],
     equation_error: EquationError,
 ) -> Continuation:
-    """The lowest end of a law, also searched from its nested law, unless it loses by that.
+    """The lowest end of a law, also searched from its nested law, unless that makes it worse.
 
     Args:
         own: search of the law itself.
@@ -202,19 +202,19 @@ def best_of_starts(
     nested: HorizonResult,
     equation_error: EquationError,
 ) -> HorizonResult:
-    """A law's own end, or a lower one that it reaches from where its nested law ended.
+    """A law's own end, or a lower one reached from the end of its nested law.
 
-    A nonlinear law has several minima, and the plant decides to which of them the torques lead. So
-    it is searched again from the coefficients that they imply on the nested law's plant and, while
-    it is above the nested law, from that law itself. Priors guide each search; the ends are
-    compared by their residuals alone. Longer windows win where only the nested law could follow
-    them.
+    A nonlinear law has several minima, and the plant determines to which of them the torques lead.
+    So the search is repeated from the coefficients that they imply on the nested law's plant and,
+    as long as its residual exceeds the nested law's, from that law itself. Priors guide each
+    search; ends are compared only by their residuals. Longer windows win if only the nested law
+    could follow them.
     """
     if nested.stopped:
         return own.as_stopped()
     windows, options, law = _windows_from(nested), fitter.options, fitter.friction.law
     same = windows.spans == own.problem.windows.spans
-    # If one of the two failed at the longest windows, its residuals are no measure.
+    # If one of the two failed at the longest windows, residuals cannot be compared.
     if not same and len(windows) >= len(own.problem.windows):
         return own
     # With the larger noise of the two, priors would outweigh the data.
@@ -245,7 +245,7 @@ def best_of_starts(
 def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
     """Coefficients at which a law equals its nested law, (joint, coefficient).
 
-    Those in which the law is nonlinear are taken from `shapes`.
+    Nonlinear coefficients are taken from `shapes`.
     """
     linear = torch.tensor([c.linear for c in law.coefficients])
     embedded = torch.where(linear, 0.0, shapes)
@@ -254,7 +254,7 @@ def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
 
 
 def _windows_from(found: HorizonResult) -> Windows:
-    """The windows of a stage at the states that it found, except for those that are known."""
+    """The windows of a stage at the states that it found, except for known states."""
     windows = found.problem.windows
     states = found.problem.variables.split(found.result.x).states
     joints = windows.q0.shape[-1]
@@ -265,9 +265,9 @@ def _windows_from(found: HorizonResult) -> Windows:
 
 
 def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:
-    """Half the sum of squares of residuals; infinite where the motion diverged.
+    """Half the sum of squares of residuals, infinite if the motion diverged.
 
-    All that are compared have the same loss.
+    Stages to be compared have the same loss.
     """
     problem, x = replace(found.problem, loss=loss), found.result.x
     misfit = weighted_cost(problem.counted_errors(x), noise)

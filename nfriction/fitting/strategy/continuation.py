@@ -1,4 +1,4 @@
-"""Horizon continuation: shooting windows of growing length, each started at the last end."""
+"""Horizon continuation: shooting windows of growing length, each started at the previous end."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -50,7 +50,7 @@ class HorizonResult:
 
     @cached_property
     def residuals(self) -> Tensor:
-        """Position errors as the loss counts them [rad; m], (window, step + 1, joint)."""
+        """Position errors as weighted by the loss [rad; m], (window, step + 1, joint)."""
         return self.problem.counted_errors(self.result.x)
 
     @property
@@ -79,11 +79,11 @@ class HorizonResult:
         return explained(self.problem, self.result.x, self.rms)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
-        """True if the longer windows only show that the motion forgets its start within them."""
+        """True if the longer windows only show that the motion is chaotic within them."""
         return not self.rms <= options.max_growth * before.rms and not self.result.converged
 
     def as_stopped(self) -> "HorizonResult":
-        """The same, reported as stopped by the caller."""
+        """The same stage, reported as stopped by the caller."""
         return replace(self, result=replace(self.result, status="stopped"))
 
 
@@ -108,7 +108,7 @@ class ShootingFitter:
 
     def cut(self, motions: Sequence[Motion], length: float) -> Windows:
         """Windows of the recordings, each from the state that a motion has there."""
-        # Encoders that were zeroed where stiction held the links were zeroed at rest.
+        # Encoders zeroed in a pose held by stiction were zeroed at rest.
         rest_speed = None if self.offset_sd is None else self.options.rest_speed
         return cut_windows(self.recordings, motions, length, rest_speed=rest_speed)
 
@@ -133,8 +133,8 @@ class ShootingFitter:
     ) -> HorizonResult:
         """Minimise a problem of this fitter.
 
-        `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
-        the callback. A robust loss without a scale gets that of the errors in the end.
+        `tolerance` is the relative decrease of the cost that counts as zero, `name` is for the
+        callback. A robust loss without a scale finally gets that of the errors.
         """
         options, x = self.options, start
         solver = LevenbergMarquardt(
@@ -195,15 +195,15 @@ class StallMonitor:
             return torch.inf
         count = self.problem.variables.shared_count
         before, self.before = self.before, x
-        # A step that damping cut short shows no convergence.
+        # A step shortened by damping does not indicate convergence.
         if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
         precision, _ = self.problem.variables.prior()
         sd = standard_deviations(information(local.hessian, precision, count))
-        # Of chaotic windows the curvature is round-off, by which nothing would ever move.
+        # The curvature of chaotic windows is round-off, in terms of which nothing would move.
         if torch.isinf(sd).all():
             return torch.inf
-        # The noise of a first stage is a guess; too large a one makes moves look small.
+        # The noise of a first stage is a guess; if it is too large, moves look small.
         samples = float(self.problem.windows.weight.sum()) * self.problem.windows.q.shape[-1]
         noise = min(1.0, math.sqrt(2.0 * float(local.cost) / samples))
         return float(((x - before)[:count] / sd).abs().max()) / max(noise, 1e-9)
@@ -211,10 +211,10 @@ class StallMonitor:
 
 @dataclass(frozen=True, eq=False)
 class Continuation:
-    """The stages of a search, each of longer windows than the one before.
+    """The stages of a search, each with longer windows than the previous one.
 
     Attributes:
-        stages: those that were kept, one at least.
+        stages: the stages that were kept, at least one.
         skipped: lengths of the windows that were skipped [s].
         reason: why the first of these was skipped; empty if the caller stopped the search.
     """
@@ -229,7 +229,7 @@ class Continuation:
         return self.stages[-1]
 
     def ending(self, end: HorizonResult) -> "Continuation":
-        """The same with another last stage."""
+        """The continuation with another last stage."""
         return replace(self, stages=(*self.stages[:-1], end))
 
 
@@ -241,19 +241,19 @@ def horizon_continuation(
     equation_error: EquationError | None = None,
     of: str = "",
 ) -> Continuation:
-    """Search windows of growing length, each from the states and with the noise of the last.
+    """Search windows of growing length, each with the states and the noise of the previous one.
 
-    A horizon that fails, or whose parameters lose what shorter ones had found (`loses`), is
-    skipped, and longer ones with it.
+    A horizon that fails, or whose parameters are worse on shorter ones (`loses`), is skipped, and
+    so are longer ones.
 
     Args:
         fitter: of the model; `options.windows` are the lengths.
         friction, plant: parameters to start from.
         motions: smoothed, in joint coordinates.
         equation_error: repeats the first and the last stage from coefficients that torques imply
-            on the plant that it found: a nonlinear law has several minima, and on a slightly
+            on the fitted plant, because a nonlinear law has several minima, and with a slightly
             wrong inertia the torques lead to a worse one.
-        of: ending of the stages' names.
+        of: suffix of the stages' names.
     """
     options = fitter.options
     stages: list[HorizonResult] = []
@@ -265,14 +265,14 @@ def horizon_continuation(
         problem = fitter.problem(fitter.cut(simulated, length), noise, friction)
         start = problem.variables.start(plant, offsets)
         if stages:
-            # States of shorter windows drift apart within longer ones. Corrected together with
-            # the parameters, they would throw these far off at the first step.
+            # States of shorter windows drift apart within longer ones. If they were corrected
+            # together with the parameters, the first step would move these far away.
             start, stopped = settle_states(problem, start)
             if stopped:
                 return Continuation((*stages[:-1], stages[-1].as_stopped()), rest)
         tolerance = options.loose_tolerance
         if last:
-            # The cost far from the minimum says nothing about its value; the last stage's does.
+            # The cost at the minimum is estimated from the last stage, not from the distant start.
             near = weighted_cost(stages[-1].residuals, noise) if stages else None
             tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
         name = f"{problem.windows.length:g} s windows{of}"
@@ -291,7 +291,7 @@ def horizon_continuation(
             return Continuation(tuple(stages), rest, "noisy" if noisy else "lossy")
         found = kept[0]
         if fitter.friction.law.memory and not (found.stopped or found.result.converged):
-            # Contacts that react strongly at the start leave a damping that makes steps short.
+            # Sensitive contacts at the start raise the damping, which keeps steps short.
             found = fitter.search(found.problem, found.result.x, tolerance, name)
         stages.append(found)
         noise = max(found.noise, options.min_noise)
@@ -303,9 +303,9 @@ def horizon_continuation(
 
 
 def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
-    """Decision variables with states and encoder offsets at their best, the shared ones held.
+    """Decision variables with the best states and encoder offsets for fixed shared variables.
 
-    True besides if the search was interrupted.
+    The second value is True if the search was interrupted.
     """
     options, count = problem.options, problem.variables.shared_count
     shared = x[:count]
@@ -325,16 +325,16 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
 
 
 def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
-    """True if a stage's parameters lose what the stages before it had found.
+    """True if a stage's parameters are significantly worse on the windows of earlier stages.
 
-    Where the encoder's rounding explains the residuals of shorter windows, law and plant are right,
-    and a loss of likelihood there beyond that of other parameters within their uncertainty is one.
-    Elsewhere law or plant are wrong, and short horizons may be traded for long ones: on free swings
-    at will, but errors of a measured torque add up over a long window and lead its parameters
-    astray. Even where these are right, the noise of torques adds up, so that longer windows may
-    determine friction less (`knows_less`). As the noise of each horizon is unknown, its log
-    likelihood is that of the root mean square residual; parameters lose that are worse at a shorter
-    horizon by more than its noise, and gain less at their own.
+    If the encoder's rounding explains the residuals of shorter windows, law and plant are correct,
+    and the stage loses if the likelihood there falls by more than uncertain parameters explain.
+    Otherwise law or plant are wrong, and short horizons may be traded for long ones: freely on free
+    swings, but errors of a measured torque accumulate over a long window and bias its parameters.
+    Even if law and plant are correct, torque noise accumulates, so that longer windows may
+    determine friction less well (`knows_less`). Since the noise of each horizon is unknown, its log
+    likelihood is that of the root mean square residual; a stage loses if its parameters are worse
+    at a shorter horizon by more than its noise, and gain less at their own.
     """
     from scipy.special import chdtri  # slow to import
 
@@ -362,11 +362,11 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
 
 
 def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
-    """True if noise of the torque makes a stage's friction less certain than that of one before.
+    """True if torque noise makes a stage's friction less certain than that of an earlier one.
 
-    That is, if noise explains the residuals of the shorter windows, and the volume of the
-    friction's uncertainty grows. Not of windows of the same length, or where either of them does
-    not determine the friction at all.
+    That is, if noise explains the residuals of the shorter windows and the volume of the friction's
+    uncertainty grows. False for windows of equal length, or if either stage does not determine the
+    friction at all.
     """
     same = found.problem.windows.spans == before.problem.windows.spans
     noisy = bool(white_noise(found.problem.windows.tau).any())
@@ -376,7 +376,7 @@ def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
 
 
 def _log_volume(of: HorizonResult) -> float:
-    """Logarithm of the volume of the friction's uncertainty; NaN where it is infinite."""
+    """Logarithm of the volume of the friction's uncertainty; NaN if it is infinite."""
     problem, options = of.problem, of.problem.options
     lower, upper = problem.variables.bounds()
     fitted = (lower < upper)[: problem.variables.shared_count].nonzero().flatten()
@@ -403,11 +403,11 @@ def restart_from_equation_error(
     name: str,
     equation_error: EquationError,
 ) -> HorizonResult:
-    """A stage, or the lowest that starts where torques lead on its plant, if lower.
+    """A stage, or a lower one from coefficients that torques imply on its plant.
 
     The stage's own start is not tried again. The starts after the first, from the law's grid of
-    initial values, are tried only where the encoder's rounding does not explain the residual: below
-    that is no other minimum.
+    initial values, are tried only if the encoder's rounding does not explain the residual, because
+    then there is no lower minimum.
     """
     problem, plant = found.problem, found.parts.plant
     best = found

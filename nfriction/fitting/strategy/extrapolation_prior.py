@@ -1,7 +1,7 @@
-"""Extrapolation prior: a network is pulled to its constant law where the recordings never were.
+"""Extrapolation prior: a network is pulled to its constant law at unvisited motions.
 
-Fuzzy sets reach far: friction learned at the turning points of large swings also shapes small
-swings, slow and weakly accelerated, of which the recordings show nothing.
+Fuzzy sets reach far: friction learned at the turning points of large swings also affects small
+swings, slow and weakly accelerated, which the recordings do not contain.
 """
 
 from collections.abc import Sequence
@@ -63,7 +63,7 @@ class ExtrapolationPrior:
 def prior_on_unvisited_cells(
     schedule: NeuroFuzzy, motions: Sequence[Motion], options: FitOptions = DEFAULTS
 ) -> ExtrapolationPrior:
-    """Prior at those points of a schedule's trained range that motions never came near."""
+    """Prior at those points of a schedule's trained range that no motion came near."""
     from scipy.ndimage import binary_dilation  # slow to import
 
     visits = visit_histogram(schedule, motions, options.cells)
@@ -90,8 +90,8 @@ def visit_histogram(
     """
     qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
     if schedule.along_motion:
-        # Not the network's smooth sign: at a turning point it runs through accelerations that the
-        # motion never had.
+        # Not the network's smooth sign, which at a turning point passes through accelerations that
+        # the motion never had.
         qdd = np.where(qd < 0, -qdd, qdd)
     lower, upper = (getattr(schedule, f"acceleration_{end}").numpy() for end in ("lower", "upper"))
     speed = np.abs(qd) / schedule.velocity_range.numpy()

@@ -135,8 +135,8 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
         fitter = widened_fitter(task, start, inputs, math.exp(log_time))
         friction = fitter.friction.schedule.parameter_vector()
         plant, residuals = known_terms(start, fitter.jacobian.terms), start.residuals
-        # Beside the noise that the law without inputs leaves, a first search is drawn to the prior;
-        # and its windows start with the heat that the friction before it leaves.
+        # With the noise of the law without inputs, a first search is drawn to the prior, and its
+        # windows start with the heat of the previous friction.
         for _ in range(1 if ends else 2):
             if ends:
                 (friction, plant, *_), residuals = ends[-1].parts, ends[-1].residuals
@@ -178,7 +178,7 @@ def drives(found: FitResult, own: int) -> bool:
         without = fitted.clone()
         without[..., own:] = 0.0
         power, least = (qd * law.torque(qd, load, c, v_smooth) for c in (fitted, without))
-        # At some speeds the shape of a law may be off; a constant torque does work on one side.
+        # A law may be wrong at some speeds; a constant torque does work in one direction only.
         for turning in (qd > 0, qd < 0):
             work, own_work = ((p * turning).sum(0) for p in (power, least))
             if (work < own_work.clamp(max=0.0)).any():
@@ -187,7 +187,7 @@ def drives(found: FitResult, own: int) -> bool:
 
 
 def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
-    """Inputs that evidence favours, the best first; each beside those before.
+    """Inputs that the evidence favours, the best first, each given the previous ones.
 
     Args:
         task: with recordings and motions free of encoder offsets.
@@ -241,9 +241,9 @@ class _Choice:
         return cls(errors, prior, bounds, columns)
 
     def forward(self, least: float) -> list[InputGain]:
-        """Inputs one after the other, as long as one raises the log evidence by more than this.
+        """Forward selection of inputs, as long as one raises the log evidence by more than `least`.
 
-        Each is judged beside the noise that those before it leave.
+        Each is judged relative to the residual noise given the inputs selected before.
         """
         chosen: list[InputGain] = []
         held: list[int] = []
@@ -269,8 +269,8 @@ class _Choice:
     def evidence(self, held: Sequence[int], scale: float) -> tuple[float, float]:
         """Log evidence with the columns `held`, up to a constant, and the errors' cost.
 
-        By Laplace's approximation at the minimum within the bounds. The errors count `scale` times,
-        for a smaller noise than that of the law.
+        Laplace's approximation at the minimum within the bounds. The squared errors are multiplied
+        by `scale`, to account for a smaller noise than that of the law.
         """
         others = {c for columns in self.columns.values() for c in columns}.difference(held)
         free = [k for k in range(len(self.prior.gradient)) if k not in others]

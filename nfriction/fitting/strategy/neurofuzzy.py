@@ -1,10 +1,10 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First the law takes further inputs (`inputs`) with which it errs less on windows held out. Then the
-network trains with its sets where they are, and windows held out choose the priors. It trains on at
-the noise that it left, with a prior for each group of parameters by evidence, and moves its sets if
-the evidence favours that; as long as the windows held out gain by it, at ever less noise. Every
-window is held out in turn, and a gain has to be larger than its scatter over the windows explains.
+First the law takes further inputs (`inputs`) with which it wins on hold-out windows. Then the network
+trains with fixed sets, and hold-out windows choose the priors. Training continues with the residual
+noise, with the prior of each group of parameters set by evidence, and moves the sets if the
+evidence favours that; this is repeated with ever smaller noise as long as the hold-out windows
+improve. Every window is held out in turn, and a gain has to exceed its scatter over the windows.
 """
 
 import copy
@@ -123,10 +123,7 @@ def _without_inputs(task: FitTask) -> FitTask:
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
-    """The inputs with which the law wins on the windows held out and the contest with them.
-
-    Or none, and the one without.
-    """
+    """Inputs with which the law wins on hold-out windows, and the contest with them; or none."""
     task = plain.task
     chosen = chosen_inputs(task, plain.start)
     names = [gain.name for gain in chosen]
@@ -142,7 +139,7 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     if not gains(rival.validation.of_law, plain.validation.of_law, task.options.input_chance):
         return (), plain
     rival.train()
-    # Friction of the law alone may drive where that of its network does not.
+    # Friction of the law alone may drive a joint even if that of its network does not.
     return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
 
@@ -176,12 +173,12 @@ class _Contest:
         self.best: Trial | None = None
 
     def accepts(self, trial: "Trial") -> bool:
-        """True for a network that beats the law on windows held out."""
+        """True for a network that beats the law on hold-out windows."""
         return gains(trial.squares, self.validation.of_law)
 
     @property
     def found(self) -> FitResult:
-        """The law's fit, with the model and plant of the network where it is accepted."""
+        """The law's fit, with the model and plant of the network if it is accepted."""
         assert self.best is not None
         if not self.accepts(self.best):
             return self.start
@@ -195,12 +192,12 @@ class _Contest:
             self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
     def halt(self) -> None:
-        """Keep the network as it is: the caller stopped what was to come."""
+        """Keep the network as it is, because the caller stopped its further training."""
         if self.best is not None:
             self.best = replace(self.best, end=self.best.end.as_stopped())
 
     def result(self, model: FrictionModel) -> FitResult:
-        """The network trained on, or its law, written into a model of the same kind."""
+        """The fully trained network, or its law, written into a model of the same kind."""
         task, best, validation = self.task, self.best, self.validation
         if best is None:
             return self._kept(model, INTERRUPTED, converged=False)
@@ -298,7 +295,7 @@ def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[Shoot
 def local_model(end: HorizonResult) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Curvature of errors and of known priors, offsets and groups, for `group_evidence`.
 
-    By the Gauss-Newton model of a search's end with window states integrated out, in units of the
+    From the Gauss-Newton model at a search's end with window states marginalised, in units of the
     network's prior, so that each group has precision 1. The plant's prior and that on unvisited
     motion are known.
     """
@@ -319,20 +316,20 @@ def local_model(end: HorizonResult) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     lower, upper = (bound[:shared] for bound in variables.bounds())
     fitted = (lower < upper).nonzero().flatten()
     values, vectors = torch.linalg.eigh(data[fitted][:, fitted])
-    # Less than none is the rounding of states that grow by orders of magnitude.
+    # Negative eigenvalues are round-off of states that grow by orders of magnitude.
     data = (vectors * values.clamp_min(0.0)) @ vectors.T
     offset = (end.result.x - mean)[:shared] / unit
     return data, known[fitted][:, fitted], offset[fitted], groups[fitted]
 
 
 def network_evidence(end: HorizonResult) -> GroupEvidence:
-    """Evidence for the prior of each group of a network's parameters, relative to that it has."""
+    """Evidence for the prior of each group of a network, relative to the present prior."""
     groups = len(cast("NeuroFuzzy", end.problem.friction.schedule).group_names())
     return group_evidence(*local_model(end), torch.ones(groups, dtype=torch.float64))
 
 
 def log_evidence(end: HorizonResult) -> float:
-    """Log evidence up to a constant, comparable at one noise; -inf where it is not finite."""
+    """Log evidence up to a constant, comparable at equal noise; -inf if it is not finite."""
     if not end.result.hessian.isfinite().all():
         return -math.inf
     return network_evidence(end).occam - float(end.result.cost)
@@ -351,7 +348,7 @@ def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ..
 class Trial:
     """A model trained on the windows of the first split, and its priors.
 
-    Its squared errors are those on windows held out: of the first split, or of all once judged.
+    Its squared errors are those on hold-out windows: of the first split, or of all once judged.
     """
 
     squares: Tensor
@@ -388,7 +385,7 @@ class Validation:
 
     @cached_property
     def of_law(self) -> Tensor:
-        """Squared errors of the law on each window held out, (window,)."""
+        """Squared errors of the law on each hold-out window, (window,)."""
         values = self.law.friction.schedule.parameter_vector()
         return self.judged(self.trial(self.law, values, "constant law, hold-out")).squares
 
@@ -398,7 +395,7 @@ class Validation:
         best: Trial | None = None
         for fitter in fitters:
             schedule = cast("NeuroFuzzy", fitter.friction.schedule)
-            # From zero: from another prior's end a network would stay there.
+            # From zero, because a network would stay at another prior's end.
             zeros = torch.zeros_like(schedule.parameter_vector())
             trials = []
             for share in self.options.prior_shares:
@@ -413,11 +410,11 @@ class Validation:
         return best
 
     def trained_on(self, trial: Trial) -> Trial:
-        """A trial trained on at the noise that it left, or itself where that gains too little.
+        """A trial trained further at its residual noise, or itself if that gains too little.
 
-        Beside the law's error as noise, sets could hardly move. They move if the evidence favours
-        it. Windows that the measurement noise explains cannot judge; there it is trained on as far
-        as its noise falls, since beside too large a noise the priors outweigh the data.
+        With the law's error as noise, sets could hardly move. They move if the evidence favours it.
+        Windows that the measurement noise explains cannot judge; in that case training continues as
+        long as its noise falls, since with too large a noise the priors outweigh the data.
         """
         residuals, used = trial.end.residuals, trial.end.problem.noise_sd
         noise = max(min(effective_noise(residuals), self.noise), self.options.min_noise)
@@ -436,9 +433,9 @@ class Validation:
         return judged if explained and not gains(trial.squares, judged.squares) else trial
 
     def _adapted(self, trial: Trial, noise: float, stride: int, *, learn_sets: bool) -> Trial:
-        """A trial trained on, the prior of each group tightened as far as evidence favours it.
+        """A trial trained further, the prior of each group tightened as far as evidence favours it.
 
-        It is never widened: beyond it the model of the errors is not quadratic in the sets.
+        It is never widened, because beyond it the errors are not quadratic in the sets.
         """
         model = model_at(trial.fitter.friction, trial.end.parts.friction)
         schedule = cast("NeuroFuzzy", model.schedule)
@@ -470,9 +467,9 @@ class Validation:
         return self._further(trial, self.windows, f"{self.length:g} s windows")
 
     def lost_by(self, end: HorizonResult) -> str:
-        """Why a network is rejected that is worse over windows as long as its law's; "" if not.
+        """Reason to reject a network that is worse than its law over the law's windows, or "".
 
-        Shorter ones, of which some can be held out, hardly show a force that is slightly off.
+        Hold-out windows are shorter, and hardly show a small error of the torque.
         """
         windows = self.law.cut(self.motions, self.length)
         if end.stopped or windows.spans == self.windows.spans:
@@ -485,7 +482,7 @@ class Validation:
         return LOST.format(windows.length, worse) if worse > 0 else ""
 
     def _further(self, trial: Trial, windows: Windows, name: str) -> HorizonResult:
-        """The network of a trial, fitted to other windows from where it is."""
+        """The network of a trial, fitted further to other windows."""
         (friction, plant, *_), before = trial.end.parts, trial.end.problem
         problem = trial.fitter.problem(windows, before.noise_sd, friction, stride=before.stride)
         return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
@@ -516,7 +513,7 @@ class Validation:
 def constant_kept(
     start: FitResult, model: FrictionModel, note: str, *, converged: bool = True
 ) -> FitResult:
-    """The constant fit as that of a model, which is its law; a note gives the reason."""
+    """The constant fit as the fit of a model that equals its law; a note gives the reason."""
     return replace(
         start,
         model=model.requires_grad_(False),

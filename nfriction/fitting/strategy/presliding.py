@@ -1,7 +1,7 @@
-"""Starts of laws with memory, and the stiffness that data leave open.
+"""Starts of laws with memory, and stiffness that data do not determine.
 
-Presliding over displacements of a thousandth to thousands of encoder counts is possible, so they
-are tried one by one on short windows.
+Presliding may extend over a thousandth of an encoder count or over thousands, so displacements are
+tried one by one on short windows.
 """
 
 import itertools
@@ -19,18 +19,18 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.signals import Motion
 
-# Displacements over which a contact yields, over the range of the motion, and ratios of damping to
-# stiffness [s]: from what hardly shows to what would be no presliding.
+# Presliding displacements, relative to the range of the motion, and ratios of damping to stiffness
+# [s]: from hardly visible to values that mean no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
-# Distance from a reversal, over that range, from where on a contact surely slides.
+# Distance from a reversal, relative to that range, beyond which a contact surely slides.
 TRAVELLED = 0.1
-# Rises of friction at rest over that at high speed: torques of joints that stick do not show them.
+# Relative excess of static friction, which torques of sticking joints do not show.
 PEAKS = (0.1, 0.3, 1.0)
-# Displacements that are searched from where the first leaves more than the encoder's rounding.
+# Displacements searched if the first leaves more than the encoder's rounding.
 MOST_STARTS = 4
 
-# Stiffness and damping of a rival over those found: its contacts relax at once.
+# Stiffness and damping of a rival relative to those found: its contacts relax at once.
 STIFFER = (10.0, 0.01)
 
 
@@ -40,13 +40,12 @@ def presliding_starts(
 ) -> Iterator[Tensor]:  # fmt: skip
     """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
 
-    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
-    a joint slides alone; `apart`, (joint, coefficient), is the first by the torques far from
-    reversals, and takes its place where short windows agree better with it. The displacement over
-    which its contact yields is sought among shares of the joint's range, its damping among times,
-    by the cost of short windows; the rise of friction at rest and its velocity likewise, in turn.
-    Several displacements of the first set follow, and the best of every other one where the law has
-    no such rise.
+    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which describe
+    only sliding; `apart`, (joint, coefficient), is the first set from the torques far from
+    reversals, and replaces it if short windows agree better with it. Presliding displacement (a
+    share of the joint's range) and damping (a time) are chosen by the cost of short windows; the
+    excess of static friction and its velocity likewise, in turn. Several displacements of the first
+    set follow, and the best of every other set if the law has no such excess.
     """
     for place, coefficients in enumerate(sliding):
         if place and peaked(fitter.friction.law, coefficients):
@@ -61,7 +60,7 @@ def presliding_starts(
 def _yielding_alike(
     fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
 ) -> "list[_Start]":
-    """The best coefficients of every share of the range, least cost of short windows first."""
+    """The best coefficients for every share of the range, smallest cost of short windows first."""
     law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
     ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
 
@@ -79,7 +78,7 @@ def _yielding_alike(
         rows = ([yields(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
         return sorted((min(row, key=_Start.rank) for row in rows), key=_Start.rank)
 
-    # All joints alike first, then each by itself.
+    # First all joints together, then each separately.
     everyone = range(len(coefficients))
     found = best(everyone, coefficients)
     while peaks := [tried(trial) for trial in peaked(law, found[0].coefficients)]:
@@ -103,12 +102,12 @@ class _Start(NamedTuple):
 def ambiguous_stiffness(
     fitter: ShootingFitter, found: HorizonResult, stage: HorizonResult
 ) -> list[str]:
-    """Names of stiffness and damping of bristles that the data leave open.
+    """Names of stiffness and damping of bristles that the data do not determine.
 
-    Presliding below what the encoder resolves has minima of about equal cost at quite different
-    stiffness. A search from far stiffer bristles finds another one; where it differs by more than
-    a factor of two, and the likelihood does not prefer the first, neither is known; nor where a
-    search ended early, and the other one explains the motion to the encoder's rounding.
+    Presliding that the encoder does not resolve has minima of about equal cost at very different
+    stiffness. A search from much stiffer bristles finds another one; if it differs by more than a
+    factor of two and the likelihood does not prefer the first, neither is known. The same holds if
+    a search ended early, and the other one explains the motion to the encoder's rounding.
 
     Args:
         fitter: of the law.
@@ -119,7 +118,7 @@ def ambiguous_stiffness(
 
     problem, law = stage.problem, stage.problem.friction.law
     count, tolerance = problem.variables.shared_count, fitter.options.loose_tolerance
-    # Terms that only the end may have come last.
+    # Terms that only the end may have are last.
     start = torch.cat([found.result.x[:count], stage.result.x[count:]])
     found = fitter.search(problem, start, tolerance, "stiffness")
     places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
@@ -130,7 +129,7 @@ def ambiguous_stiffness(
     rival = fitter.search(problem, start, tolerance, "stiffer bristles")
     # The noise of a first stage is a guess.
     lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
-    # Of searches that ended before a minimum, costs are no likelihoods.
+    # The costs of searches that ended before a minimum are not likelihoods.
     early = not (found.result.converged and rival.result.converged)
     explained = early and rival.rms <= rounding(problem)
     if not (explained or lost < 0.5 * float(chdtri(len(table) * len(places), 0.05))):
@@ -144,7 +143,7 @@ def ambiguous_stiffness(
 
 
 def peaked(law: Law, coefficients: Tensor) -> list[Tensor]:
-    """Coefficients (joint, coefficient) with other rises of the friction at rest."""
+    """Coefficients (joint, coefficient) with other excesses of static friction."""
     if not {"F_c", "F_d", "v_s"} <= set(law.names):
         return []
     found = []
@@ -157,10 +156,10 @@ def peaked(law: Law, coefficients: Tensor) -> list[Tensor]:
 
 
 def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
-    """Coefficients of one joint that slides alike, but yields over a displacement before.
+    """Coefficients of one joint with the same sliding friction and a presliding displacement.
 
-    `time` is the ratio of the damping of a bristle to its stiffness [s]. Laws that name their
-    coefficients otherwise stay as they are.
+    `time` is the ratio of the damping of a bristle to its stiffness [s]. Laws with other names for
+    these coefficients are unchanged.
     """
     values = dict(zip(law.names, coefficients.tolist(), strict=True))
     widths = [name for name in values if name.startswith("d_") and f"k{name[1:]}" in values]

@@ -1,8 +1,8 @@
 """Recordings as files: CSV, Parquet, NPZ, MATLAB, HDF5 and MDF as tables.
 
-A table is a pandas DataFrame with columns `time`, `q1` …, `qd1` …, `tau1` …, or the file's names of
-them; cells of a CSV file stay text. Its `attrs` hold the file's other information: `convention`,
-`unit`, `names`, and `units` by column.
+A table is a pandas DataFrame with columns `time`, `q1` …, `qd1` …, `tau1` …, or the file's names
+for them; cells of a CSV file stay text. Its `attrs` contain the file's other information:
+`convention`, `unit`, `names`, and `units` by column.
 
 pandas is slow to import, so only functions that make tables import it.
 """
@@ -30,7 +30,7 @@ __all__ = ["Arrays", "column_numbers", "read_table", "stem", "table_arrays", "wr
 # An hour of ten joints at 1 kHz with torque and velocity, as numbers [bytes].
 LARGEST = 2**30
 MOST_COLUMNS = 2000
-# Measurements compress to a tenth, perhaps; to this share only what is nearly constant.
+# Measurements compress to perhaps a tenth; only nearly constant data exceed this ratio.
 UNSUSPECTED, LARGEST_RATIO = 2**26, 200
 
 # Modules and functions by ending, imported on use.
@@ -63,8 +63,8 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
 
     Args:
         path: of the file.
-        sources: wanted columns, perhaps with a unit after a colon; formats that hold much else give
-            only these and those with names of ours.
+        sources: wanted columns, optionally with a unit after a colon; from formats with much other
+            content only these and columns with our names are read.
     Raises:
         FileNotFoundError: there is no such file.
         ImportError: a format whose library is not installed.
@@ -104,7 +104,7 @@ def stem(path: str | os.PathLike[str]) -> str:
     try:
         return name.decode()
     except UnicodeDecodeError:
-        # Of an older system, like the file's content; Python's stand-ins cannot be written.
+        # Names from older systems; Python's surrogate characters cannot be written.
         return name.decode("latin-1")
 
 
@@ -114,20 +114,20 @@ def most_unpacked(packed: int) -> int:
 
 
 def refuse_bomb(unpacked: int, packed: int) -> None:
-    """Raise ValueError where a file unpacks to far more [bytes] than measurements would."""
+    """Raise ValueError if a file unpacks to far more [bytes] than measurements would."""
     refuse_size(unpacked, "unpacked bytes")
     if unpacked > most_unpacked(packed):
         raise ValueError(
             f"it unpacks to {unpacked} bytes or more, {unpacked // max(packed, 1)} times its size, "
-            f"as no recording does; if it is one, write it uncompressed"
+            f"unlike recordings; if it is one, write it uncompressed"
         )
 
 
 def refuse_size(count: int, unit: str = "bytes") -> None:
-    """Raise ValueError where a file is larger than any recording."""
+    """Raise ValueError if a file is larger than any recording."""
     if count > LARGEST:
         raise ValueError(
-            f"it holds {count} {unit}, more than {LARGEST} are read; cut it into parts"
+            f"it has {count} {unit}, more than the limit of {LARGEST}; cut it into parts"
         )
 
 
@@ -136,5 +136,5 @@ def _ending(path: Path, known: Iterable[str], verb: str) -> str:
         if path.name.lower().endswith(ending):
             return ending
     raise ValueError(
-        f"'{path}' must end in one of {', '.join(known)}, the formats that are {verb}."
+        f"'{path}' must end in one of {', '.join(known)}, the formats that can be {verb}."
     )

@@ -1,4 +1,4 @@
-"""Parquet and NPZ: tables that are stored column by column."""
+"""Parquet and NPZ: tables stored column by column."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
     from pyarrow.parquet import ParquetFile
 
     content = io.BytesIO(path.read_bytes())
-    # Equal numbers compress to almost nothing, so the file's size is no bound.
+    # Equal numbers compress to almost nothing, so the file's size does not limit the table's.
     metadata = ParquetFile(content).metadata
     if metadata.num_columns > MOST_COLUMNS:
         raise ValueError(f"it has more than {MOST_COLUMNS} columns")
@@ -35,7 +35,7 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
         table = pd.read_parquet(content, engine="pyarrow")
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"the description of its columns is damaged: {error!r}") from error
-    # pandas copies all attributes at every step, so foreign ones are dropped.
+    # pandas copies all attributes at every step, so unknown ones are dropped.
     table.attrs = {k: table.attrs[k] for k in ATTRIBUTES if isinstance(table.attrs.get(k), str)}
     return table
 
@@ -84,12 +84,12 @@ def _array(content: bytes) -> np.ndarray:
     size; here the header has one form, and its claims must match the data.
     """
     if content[:6] != b"\x93NUMPY" or len(content) < 12:
-        raise ValueError("it holds something that is no array")
+        raise ValueError("it contains something that is not an array")
     wide = content[6] > 1
     size, begin = struct.unpack_from("<I" if wide else "<H", content, 8)[0], 12 if wide else 10
     header = _HEADER.fullmatch(content[begin : begin + size])
     if header is None:
-        raise ValueError("an array in it is none of numbers or text, or its header is damaged")
+        raise ValueError("an array in it is neither numbers nor text, or its header is damaged")
     kind, columns_first, lengths = header.groups()
     shape = [int(length) for length in lengths.replace(b",", b" ").split()]
     form, data = np.dtype(kind.decode()), memoryview(content)[begin + size :]

@@ -1,12 +1,12 @@
-"""Measurement files that hold much else: MATLAB and HDF5, and ASAM MDF (.mf4).
+"""Measurement files with much other content: MATLAB and HDF5, and ASAM MDF (.mf4).
 
 SciPy reads MATLAB's version 5 and asammdf reads MDF, both in a worker process; MATLAB's version 7.3
 is HDF5.
 
-In nested data every array goes by its path: `data.Y.q1` is a field of a field, `data.Y[2]` an
-element, `q[0]` a column of a matrix (samples run along its longer side). Records of dSPACE
-ControlDesk (`X` and `Y`, arrays of structs with `Name` and `Data`) also give each signal by its
-`Name`, and the time axis as `time`.
+In nested data every array is named by its path: `data.Y.q1` is a field of a field, `data.Y[2]` an
+element, `q[0]` a column of a matrix (samples run along its longer side). In records of dSPACE
+ControlDesk (`X` and `Y`, arrays of structs with `Name` and `Data`) each signal is also available by
+its `Name`, and the time axis as `time`.
 
 References:
     MathWorks, MAT-File Format (level 5).
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Columns = dict[str, NDArray[Any]]
 
-# A deeper or wider structure holds no recording.
+# A deeper or wider structure is not a recording.
 DEEPEST, MOST = 32, 100_000
 MOST_COLUMNS = 1000
 
@@ -45,7 +45,7 @@ class Signals(NamedTuple):
 
     columns: Columns  # vectors by name
     found: list[str]  # names of all signals in the file
-    units: dict[str, str]  # of the columns, where the file has any
+    units: dict[str, str]  # of the columns, if the file has any
 
     def table(self) -> pd.DataFrame:
         """The columns as a table."""
@@ -63,7 +63,7 @@ class Signals(NamedTuple):
 def choose_signals(
     content: dict[str, Any], sources: Sequence[str], *, slashes: bool = False
 ) -> Signals:
-    """Choose the signals asked for, and those with names of ours, in dicts, lists and arrays.
+    """Choose the requested signals, and those with our names, in dicts, lists and arrays.
 
     With `slashes`, paths may also be written `data/Y/q1` and `/data/Y/q1`.
     """
@@ -71,10 +71,10 @@ def choose_signals(
     for path, values in _walk(content, "", 0):
         signals[path] = values
         if len(signals) > MOST:
-            raise ValueError(f"it holds more than {MOST} signals")
-    # Paths win over names, for names in a file are arbitrary.
+            raise ValueError(f"it has more than {MOST} signals")
+    # Paths take precedence over names, because names in a file are arbitrary.
     signals = _controldesk(content) | signals
-    # A matrix called q holds a joint in each column.
+    # A matrix called q has one column for each joint.
     for key in ("q", "qd", "tau"):
         for k in range(MOST_COLUMNS):
             if f"{key}[{k}]" not in signals:
@@ -91,7 +91,7 @@ def choose_signals(
 
 
 def asked_names(names: set[str], sources: Sequence[str]) -> set[str]:
-    """The names in a file that sources ask for."""
+    """The names in a file that sources request."""
     return {s.column for spec in sources if (s := parse_source(spec, names))}
 
 
@@ -114,7 +114,7 @@ def _vectors(values: NDArray[Any], path: str) -> Iterator[tuple[str, NDArray[Any
     if values.ndim == 1:
         yield path, values
     elif values.ndim == 2:
-        # A square matrix does not show which way time runs: down, as in a table.
+        # A square matrix does not show the direction of time: then down, as in a table.
         columns = values.T if values.shape[0] >= values.shape[1] else values
         if len(columns) <= MOST_COLUMNS:
             yield from ((f"{path}[{k}]", column) for k, column in enumerate(columns))
@@ -128,7 +128,7 @@ def _controldesk(content: dict[str, Any]) -> Columns:
         if not (isinstance(record, dict) and {"X", "Y"} <= record.keys()):
             continue
         axes, signals = _named_data(record["X"]), _named_data(record["Y"])
-        # With several time axes none of them is the common one.
+        # With several time axes there is no common one.
         if len(axes) == 1:
             signals.append(("time", axes[0][1]))
         for label, values in signals:
@@ -151,7 +151,7 @@ def _named_data(entries: Any) -> list[tuple[str, NDArray[Any]]]:
     return pairs
 
 
-# Processor time of the worker [s]: for imports, and for a byte of the file.
+# Processor time of the worker [s]: for imports, and per byte of the file.
 STARTING, BY_BYTE = 20.0, 1e-7
 # Address space for libraries and several copies of a file [bytes].
 MEMORY = 16 * LARGEST
@@ -161,13 +161,13 @@ _HEADER, _COMPRESSED = 128, 15
 
 
 def read_mat(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the signals asked for, by the paths of variables and fields."""
+    """Table of the requested signals, named by the paths of variables and fields."""
     with path.open("rb") as file:
         start = file.read(1024)
     if SIGNATURE in start:
         return read_hdf5(path, sources)
     if len(start) < _HEADER or start[126:128] not in (b"IM", b"MI"):
-        raise ValueError("it is no MATLAB file of version 5 or 7.3")
+        raise ValueError("it is not a MATLAB file of version 5 or 7.3")
     refuse_size(path.stat().st_size)
     _check_unpacked_size(path.read_bytes())
     return read_in_worker("SciPy", path, sources)
@@ -183,7 +183,7 @@ def _mat_signals(path: Path, sources: Sequence[str]) -> Signals:
 
 def _nested(value: Any) -> Any:
     """SciPy's records as dicts, or lists of them, its cells as lists, its text as str."""
-    # Subclasses hold MATLAB's objects and functions, which are no signals.
+    # Subclasses represent MATLAB's objects and functions, which are not signals.
     if type(value) is not np.ndarray:
         return value
     if value.dtype.names:
@@ -210,7 +210,7 @@ def _check_unpacked_size(content: bytes) -> None:
 
 
 def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the signals asked for, by the paths of groups and data sets."""
+    """Table of the requested signals, named by the paths of groups and data sets."""
     try:
         import h5py
     except ImportError as error:
@@ -241,7 +241,7 @@ class _Reader:
         return {
             name: self.item(group[name], depth + 1)
             for name in names
-            # Other links may lead out of the file.
+            # Other links may point outside the file.
             if type(group.get(name, getlink=True)).__name__ == "HardLink"
         }
 
@@ -249,17 +249,17 @@ class _Reader:
         self.count += 1
         if depth > DEEPEST or self.count > MOST:
             raise ValueError("it is nested too deeply, or in a loop")
-        if not hasattr(item, "shape"):  # a group, or a type that has a name
+        if not hasattr(item, "shape"):  # a group, or a named type
             content = self.group(item, depth) if hasattr(item, "keys") else {}
             return _struct_array(content)
         self.bytes += int(item.size or 0) * item.dtype.itemsize
-        # Before it is read: chunks that were never written take no space in the file.
+        # Before reading, because chunks that were never written take no space in the file.
         refuse_bomb(self.bytes, self.size)
         if item.dtype.kind == "O":
             return self._referred(item, depth)
         if item.dtype.kind not in "fiub" or item.shape is None:
             return None
-        # Never read other files; an empty array stores its shape in place of samples.
+        # Never read other files. An empty array stores its shape in place of samples.
         if item.external or item.is_virtual or item.attrs.get("MATLAB_empty"):
             return None
         values = np.asarray(item[()])
@@ -270,7 +270,7 @@ class _Reader:
         return values if kind is None else values.T
 
     def _referred(self, item: Any, depth: int) -> list[Any]:
-        """Targets of the references of a cell, or of a field of an array of structs."""
+        """Targets of the references in a cell, or in a field of an array of structs."""
         import h5py
 
         if h5py.check_ref_dtype(item.dtype) is not h5py.Reference:
@@ -282,7 +282,7 @@ class _Reader:
 
 
 def _struct_array(content: dict[str, Any]) -> dict[str, Any] | list[dict[str, Any]]:
-    """Turn fields that are all lists of one length into the array of structs that they were."""
+    """Turn fields that are all lists of one length back into an array of structs."""
     lengths = {len(value) if isinstance(value, list) else -1 for value in content.values()}
     if len(lengths) != 1 or -1 in lengths:
         return content
@@ -290,7 +290,7 @@ def _struct_array(content: dict[str, Any]) -> dict[str, Any] | list[dict[str, An
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the channels asked for, with their units; `time` is their common time."""
+    """Table of the requested channels, with their units; `time` is their common time."""
     if find_spec("asammdf") is None:
         raise ImportError(
             "MDF files need asammdf: pip install nfriction[mdf]; or export them as .csv or .mat."
@@ -312,20 +312,20 @@ def choose_channels(file: Any, sources: Sequence[str]) -> Signals:
     columns: dict[str, Any] = {}
     units: dict[str, str] = {}
     stamps: Any = None
-    # Each group has a channel of stamps, often called "time"; they come with every signal, too.
+    # Each group has a channel of time stamps, often called "time"; every signal also has them.
     ours = {name for name in places if OURS.fullmatch(name) and name != "time"}
     for name in sorted(ours | asked_names(set(places), sources)):
         # Several groups may log one signal at different rates.
         if len(places[name]) > 1:
-            raise ValueError(f"channel {name} is there more than once")
+            raise ValueError(f"channel {name} occurs more than once")
         signal = file.get(name)
         if stamps is not None and not np.array_equal(stamps, signal.timestamps):
             raise ValueError(
                 f"channel {name} was not sampled together with {next(iter(columns))}; export the "
-                "measurement on one raster, such as by asammdf's `MDF.resample`"
+                "measurement on one raster, for example with asammdf's `MDF.resample`"
             )
         if np.ndim(signal.samples) != 1:
-            raise ValueError(f"channel {name} holds arrays instead of numbers")
+            raise ValueError(f"channel {name} has arrays instead of numbers")
         stamps, columns[name] = signal.timestamps, signal.samples
         if signal.unit:
             units[name] = str(signal.unit)
@@ -335,7 +335,7 @@ def choose_channels(file: Any, sources: Sequence[str]) -> Signals:
 
 
 def read_in_worker(library: str, path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of signals that a library reads in a process of its own."""
+    """Table of signals that a library reads in a separate process."""
     size = path.stat().st_size
     refuse_size(size)
     task = {"library": library, "path": str(path.absolute()), "sources": list(sources)}
@@ -343,7 +343,7 @@ def read_in_worker(library: str, path: Path, sources: Sequence[str] = ()) -> pd.
         try:
             sandbox.run_isolated(__name__, task, Path(folder), seconds=STARTING + BY_BYTE * size)
             return load_signals(Path(folder)).table()
-        # A corrupted worker may leave anything, so reading its output may fail, too.
+        # A corrupted worker may write anything, so reading its output may also fail.
         except (sandbox.WorkerDied, OSError, EOFError, LookupError, TypeError) as error:
             raise ValueError(f"{library} cannot read it ({error})") from None
 
@@ -358,7 +358,7 @@ def main() -> None:
     sandbox.worker_main(work, refusals=(ValueError,), memory=MEMORY)
 
 
-# What reads a file in the worker, by the library that does it.
+# Readers in the worker, by library.
 SIGNALS_OF = {"SciPy": _mat_signals, "asammdf": _mdf_signals}
 
 
@@ -379,7 +379,7 @@ def load_signals(folder: Path) -> Signals:
 
 
 def _plain(samples: Any) -> NDArray[Any]:
-    """Samples in this machine's byte order and a common size; what is no number, as text."""
+    """Samples in this machine's byte order and a common size; non-numbers as text."""
     values = np.asarray(samples)
     if values.dtype.kind in "biu":
         return values.astype(values.dtype.newbyteorder("="))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Decimal signs, and what separates thousands beside each.
+# Decimal signs, and the thousands separator used with each.
 THOUSANDS = {",": ".", ".": ","}
 _NUMBER = {
     decimal: re.compile(
@@ -28,13 +28,13 @@ _FOUR_DIGITS = re.compile(r"[+-]?\d{4}", re.ASCII)
 
 
 def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[str, list[str]]:
-    """The decimal sign of a table of text cells, and the columns that leave it open.
+    """The decimal sign of a table of text cells, and the columns that are ambiguous.
 
     Args:
-        table: cells of one file, which writes all its numbers alike.
+        table: cells of one file, with one decimal sign throughout.
         stated: the sign that the file states, if it does.
-        usual: guessed where all columns can be read both ways and move alike; without commas, the
-            point.
+        usual: guess if all columns can be read both ways and move equally smoothly; without commas,
+            the point.
     """
     if stated is not None and stated not in THOUSANDS:
         raise ValueError(
@@ -46,11 +46,11 @@ def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[s
         return ".", []
     point = {name for name, cells in columns.items() if _fits(cells, ".")}
     only_comma, only_point = comma - point, point - comma
-    # Between commas, what is in quotation marks may be anything.
+    # In comma-separated files, quoted cells may contain anything.
     if only_comma and only_point and usual == ",":
         raise ValueError(
             f"column {min(only_comma)} has decimal commas and column {min(only_point)} decimal "
-            "points; write all numbers alike"
+            "points; write all numbers in the same way"
         )
     found = "." if only_point else "," if only_comma else None
     if stated and found not in (stated, None):
@@ -76,13 +76,13 @@ def column_numbers(table: pd.DataFrame, column: str) -> Array:
     """A column as float64; empty cells are NaN.
 
     Raises:
-        ValueError: a cell is no number; names it.
+        ValueError: a cell is not a number; the message names it.
     """
     cells = table[column].to_numpy(dtype=object, na_value=np.nan)
-    # A table from elsewhere states none: its text is read as Python reads it.
+    # A table that was not read here states none: its text is read as Python does.
     decimal = str(table.attrs.get("decimal"))
     texts = _texts(table[column]) if decimal in THOUSANDS else []
-    # Cells that are no such numbers stay as they are, for the message.
+    # Cells that are not such numbers stay unchanged, for the message.
     if texts and (decimal == "," or any("," in x for x in texts)) and _fits(texts, decimal):
         cells = np.array([_plain(c, decimal) if isinstance(c, str) else c for c in cells], object)
     try:

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 OURS = re.compile(r"time|(q|qd|tau|motor|current)[1-9]\d{0,3}", re.ASCII)
 # What a motor's angle and current are converted to.
 _OF_MOTORS = {"motor": "q", "current": "tau"}
-# Usual names of a torque, or of the current that makes it, with a number and a unit behind;
-# "torque_on" and "taut" are none.
+# Usual names of a torque, or of the current that produces it, followed by a number and a unit;
+# "torque_on" and "taut" are not among them.
 _LIKE_TORQUE = re.compile(
     r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
@@ -36,7 +36,7 @@ _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
 _ROTATION = {"rad": 1.0, "mrad": 1e3, "deg": 180 / math.pi, "rev": 1 / _TURN}
-# How many of each unit make one of SI: values are divided, so that milliseconds stay exact.
+# Units per SI unit: values are divided by them, so that milliseconds stay exact.
 _PER_SI: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9},
     "q": _ROTATION | {"m": 1.0, "mm": 1e3},
@@ -55,12 +55,12 @@ _SPELLINGS = {
 }  # fmt: skip
 
 
-# Those that mean nothing else: "rev" may be a direction, and SI needs no word.
+# Unambiguous units: "rev" may be a direction, and SI units need no mention.
 _UNIT_IN_NAME = re.compile(r"_(ms|us|ns|mrad|deg|mm|rpm|mNm|mA)$")
 
 
 class Source(NamedTuple):
-    """A column of a table and its unit, None if unknown; of a motor, with what to multiply by."""
+    """A column of a table and its unit, None if unknown; for a motor, with a factor."""
 
     column: str
     unit: str | None
@@ -71,10 +71,10 @@ class Source(NamedTuple):
 class Arrays(NamedTuple):
     """Arrays of a recording in SI."""
 
-    # time, q; qd where every joint has it; tau where any has, zero for the others
+    # time, q; qd if every joint has it; tau if any joint has it, zero for the others
     values: dict[str, Array]
     slides: bool | None  # whether positions are lengths; None if unknown
-    remarks: tuple[tuple[str, str], ...] = ()  # doubts about the columns, the remedy of each
+    remarks: tuple[tuple[str, str], ...] = ()  # doubts about the columns, each with its remedy
     of_motors: bool = False  # positions follow from the angles of motors
 
 
@@ -90,22 +90,22 @@ def table_arrays(
     Args:
         table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored. In place of q1
             and tau1 it may have motor1 and current1.
-        columns: the table's name for ours where they differ, perhaps with a unit: "enc_1:deg".
+        columns: the table's names for ours, optionally with a unit: "enc_1:deg".
         degrees: positions and velocities without a unit are in degrees.
         motor_factors: position per angle of a joint's motor ("motor") and torque per its current
-            ("current"), a number a joint.
+            ("current"), one number per joint.
     Raises:
         ValueError: a column or unit that is missing, unknown or contradicts another, or a column
-            named for a joint that is not there.
+            given for a joint that does not exist.
     """
-    # A table made elsewhere may number its columns.
+    # A user's table may number its columns.
     table = table.set_axis([str(name) for name in table.columns], axis=1)
     columns = {key: str(name) for key, name in (columns or {}).items()}
     sources = _sources(table, columns)
     named = [_joint_key(key) if key in sources else key for key in columns]
     sources = _of_joints(sources, columns, motor_factors or {})
     joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
-    # Of a lone q9999 one missing column is message enough.
+    # For a lone q9999 it is enough to name one missing column.
     needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
     missing = [key for key in dict.fromkeys((*needed, *named)) if key not in sources]
     if missing:
@@ -113,8 +113,8 @@ def table_arrays(
     beyond = [key for key in columns if _number(key) > joints]
     if beyond:
         raise ValueError(
-            f"`columns` names {', '.join(beyond)}, but the last position is q{joints}; name "
-            f"positions of those joints, too, or drop them."
+            f"`columns` names {', '.join(beyond)}, but the last position is q{joints}; also name "
+            f"positions of those joints, or drop them."
         )
     sources = {key: source for key, source in sources.items() if _number(key) <= joints}
     undecided = _settle_decimal_sign(table, sources)
@@ -139,9 +139,9 @@ def table_arrays(
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
-    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there.
+    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if missing.
 
-    A unit at the end of a column's name, as in "speed_rpm", holds unless another one is stated.
+    A unit at the end of a column's name, as in "speed_rpm", applies unless another one is stated.
     """
     stem, _, unit = spec.rpartition(":")
     if spec in names:
@@ -172,13 +172,13 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
     Args:
         kind: "time", "q", "qd", "tau", "motor" or "current".
         values: any shape.
-        unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count a revolution), m, mm; those
-            per second, rpm; N m, mN m, N, mN; A, mA.
+        unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count per turn), m, mm; those per
+            second, rpm; N m, mN m, N, mN; A, mA.
     """
     per = _per_si(kind, unit)
     if per is None:
         known = ", ".join(_PER_SI[kind]) + (", counts/N" if kind in ("q", "motor") else "")
-        raise ValueError(f"{unit!r} is no unit of {kind}; known are {known}.")
+        raise ValueError(f"{unit!r} is not a unit of {kind}; known units are {known}.")
     return values if per == 1.0 else values / per
 
 
@@ -210,10 +210,10 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
     for column, of in keys.items():
         if len(of) > 1:
             raise ValueError(
-                f"`columns` names column {column} for {' and '.join(of)}; each has a column of its "
-                "own, so correct one of them."
+                f"`columns` names column {column} for {' and '.join(of)}; each needs its own "
+                "column, so correct one of them."
             )
-    # A column that is mapped to one key must not also be found by its own name.
+    # A column that is mapped to one key must not also be found under its own name.
     for name in (*names, *aliases):
         if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in keys:
             found[name] = Source(name, None)
@@ -223,9 +223,9 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
     """A source by the table's own name for it, with the unit in the file."""
     column = aliases.get(source.column, source.column)
-    # pandas renames repeated columns, so that the first would be taken silently.
+    # pandas renames repeated columns, so that the first would be used silently.
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
-        raise ValueError(f"column {column} is there more than once; rename one of them.")
+        raise ValueError(f"column {column} occurs more than once; rename one of them.")
     written = _texts(table, "units").get(column)
     units = {canonical_unit(unit) for unit in (source.unit, written) if unit and is_unit(unit)}
     if source.unit and len(units) > 1:
@@ -236,7 +236,7 @@ def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Sour
 
 
 def _joint_key(key: str) -> str:
-    """Our name for what a motor's column is converted to: q1 for motor1."""
+    """Our name of the quantity to which a motor's column is converted: q1 for motor1."""
     stem = key.rstrip("0123456789")
     return _OF_MOTORS.get(stem, stem) + key[len(stem) :]
 
@@ -244,7 +244,7 @@ def _joint_key(key: str) -> str:
 def _of_joints(
     sources: dict[str, Source], columns: Mapping[str, str], factors: Mapping[str, Sequence[float]]
 ) -> dict[str, Source]:
-    """Sources by what they are of joints; a motor's count where the joint has none of its own."""
+    """Sources by quantity of a joint; a motor's are used if the joint has none of its own."""
     found = {key: source for key, source in sources.items() if _joint_key(key) == key}
     for key, source in sources.items():
         ours, kind = _joint_key(key), key.rstrip("0123456789")
@@ -257,11 +257,11 @@ def _of_joints(
         joint = int(key[len(kind) :])
         if joint > len(factors.get(kind, ())):
             if kind == "current" and key not in columns:
-                continue  # a remark says what it needs
+                continue  # a remark states what is needed
             what = "`torque_constant`" if kind == "current" else "`gear_ratio`"
             raise ValueError(
-                f"{key} is of a motor: the rig needs a `motor` with a {what} for joint {joint}, "
-                "and the reader that rig (`plant=rig`)."
+                f"{key} belongs to a motor: the rig needs a `motor` with a {what} for joint "
+                f"{joint}, and the reader needs that rig (`plant=rig`)."
             )
         found[ours] = source._replace(motor=kind, factor=factors[kind][joint - 1])
     return found
@@ -289,23 +289,21 @@ def _number(name: str) -> int:
 
 
 def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> list[tuple[str, str]]:
-    """Settle the decimal sign that the text leaves open; a remark if it remains a guess."""
+    """Settle an ambiguous decimal sign; a remark if it remains a guess."""
     columns = set(table.attrs.get("undecided", ()))
     used = [source for source in sources.values() if source.column in columns]
     for column, unit, *_ in used:
         cell = next(str(cell) for cell in table[column] if set(str(cell)) & set(THOUSANDS))
         sign = "," if "," in cell else "."
-        # Counts are whole, so it cannot be a decimal sign.
+        # Counts are whole numbers, so it cannot be a decimal sign.
         if unit and canonical_unit(unit).startswith("count"):
             table.attrs["decimal"] = THOUSANDS[sign]
             return []
     if not used:
         return []
     role = "is a decimal sign" if table.attrs["decimal"] == sign else "separates thousands"
-    finding = (
-        f"column {column} leaves open what {sign!r} in {cell!r} means; assumed is that it {role}"
-    )
-    remedy = "state the decimal sign by a line `# decimal: ,` or `# decimal: .` above the header"
+    finding = f"column {column} is ambiguous: it is assumed that {sign!r} in {cell!r} {role}"
+    remedy = "state the decimal sign with a line `# decimal: ,` or `# decimal: .` above the header"
     return [(finding, remedy)]
 
 
@@ -318,7 +316,7 @@ def _remarks(
     }
     if 0 < len(lacking["qd"]) < joints:
         finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
-        yield finding, "name or drop those of all joints"
+        yield finding, "name the columns of all joints, or of none"
     free = lacking["tau"]
     if 0 < len(free) < joints:
         finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
@@ -339,7 +337,7 @@ def _remarks(
 
 
 def _drives(table: pd.DataFrame) -> dict[str, str]:
-    """Columns that look by name or unit like torque or a motor's current, and as which of both."""
+    """Columns whose name or unit suggests a torque or a motor's current, with that quantity."""
     units, found = _texts(table, "units"), {}
     for name in map(str, table.attrs.get("found", table.columns)):
         of_unit = [kind for kind in ("tau", "current") if _per_si(kind, units.get(name, ""))]
@@ -367,22 +365,22 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     )
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
-    note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
+    note = f" {unit!r} is not a known unit." if stem in found and not is_unit(unit) else ""
     lost = [columns.get(key, key) for key in missing[:10]]
     label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
     guessed = {} if columns else _guessed(found, _drives(table))
     pairs = ", ".join(f'"{key}": "{name}"' for key, name in guessed.items())
     pairs = pairs or f'"{missing[0]}": "..."'
     return (
-        f"{label} missing; found {shown}.{note} Name the columns with columns={{{pairs}}}, a unit "
-        'after a colon where it is not SI, as in "enc_1:deg".'
+        f"{label} missing; found {shown}.{note} Name the columns with columns={{{pairs}}}, with a "
+        'unit after a colon if it is not SI, as in "enc_1:deg".'
     )
 
 
 def _guessed(found: Sequence[str], drives: Mapping[str, str]) -> dict[str, str]:
     """Our names with a file's, by usual words; empty unless time and positions are among them.
 
-    For an error's advice only: what is read is always named by the user.
+    Only for advice in an error: columns to be read are always named by the user.
     """
     plain = [name for name in found if not set(name) & set('",=:') and len(name) <= 60]
     times = [name for name in plain if _LIKE_TIME.search(name)]
@@ -395,13 +393,13 @@ def _guessed(found: Sequence[str], drives: Mapping[str, str]) -> dict[str, str]:
         f"{'motor' if name.lower().startswith('motor') else 'q'}{k}": name
         for k, name in enumerate(positions, 1)
     }
-    # Fewer than joints: it is not known which are driven.
+    # With fewer torques than joints it is unknown which joints are driven.
     if len(torques) == len(positions):
         pairs |= {f"{drives[name]}{k}": name for k, name in enumerate(torques, 1)}
     return {key: name for key, name in pairs.items() if key != name}
 
 
 def _texts(table: pd.DataFrame, key: str) -> dict[str, str]:
-    """A mapping among a table's attributes, which may come from a foreign file."""
+    """A mapping among a table's attributes, which may come from an untrusted file."""
     given = table.attrs.get(key)
     return {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}

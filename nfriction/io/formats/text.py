@@ -1,7 +1,7 @@
 """CSV as loggers write it: any separator, decimal commas, a row of units, odd encodings.
 
-The header decides the separator: a tab if it has one, else a semicolon, else a comma, else blanks.
-The decimal sign is that with which all columns are numbers, the other sign separates thousands: a
+The header determines the separator: a tab if it has one, else a semicolon, a comma, or blanks. The
+decimal sign is the one with which all columns are numbers, the other sign separates thousands: a
 single `0,5` or `1.234.567` decides for the whole file. A line `# decimal: ,` states it.
 """
 
@@ -24,13 +24,13 @@ from nfriction.io.formats.selection import is_unit
 ATTRIBUTES = ("convention", "unit", "names")
 
 _SEPARATORS = ("\t", ";", ",")
-# Lines within which a table begins, below its titles.
+# Number of lines within which a table must begin, after its titles.
 MOST_TITLES = 20
 _NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
 
 
 def read_csv(path: Path, _: object = ()) -> pd.DataFrame:
-    """Table of text cells; `attrs` hold comments, units, aliases and the decimal sign."""
+    """Table of text cells; `attrs` contain comments, units, aliases and the decimal sign."""
     return parse_csv(_decoded(path.read_bytes()))
 
 
@@ -53,7 +53,7 @@ def write_csv_gz(table: pd.DataFrame) -> bytes:
 
 def parse_csv(text: str) -> pd.DataFrame:
     """Table of a CSV text."""
-    # Only whole lines are comments, for a column may be called "enc #1".
+    # Only whole lines are comments, because a column may be called "enc #1".
     content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
     if not content:
         raise ValueError("it has no header")
@@ -63,15 +63,15 @@ def parse_csv(text: str) -> pd.DataFrame:
     header = next(csv.reader([lines[0]], delimiter=separator, skipinitialspace=True))
     most = max(len(line.split(None if separator == " " else separator)) for line in lines)
     if most > MOST_COLUMNS:
-        raise ValueError(f"it has {most} columns, more than {MOST_COLUMNS} are read")
+        raise ValueError(f"it has {most} columns, more than the limit of {MOST_COLUMNS}")
     table = pd.read_csv(
         io.StringIO("".join(content)),
         sep=r"\s+" if separator == " " else separator,
-        # As text: Python's float() is exact, the parser's default is not.
+        # As text, because Python's float() is exact but the parser's default is not.
         dtype=str,
         skipinitialspace=True,
     )
-    # pandas makes an index of surplus cells.
+    # pandas turns surplus cells into an index.
     if not isinstance(table.index, pd.RangeIndex):
         raise ValueError(
             "its rows have more cells than its header; with decimal commas, cells must be "
@@ -79,7 +79,7 @@ def parse_csv(text: str) -> pd.DataFrame:
         )
     names = [cell.strip() for cell in header]
     table.columns = _unique(str(column).strip() for column in table.columns)
-    # An ending separator makes a last column without name or content.
+    # A trailing separator creates a last column without name or content.
     unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
     table = table.drop(columns=unnamed)
     table, units = _without_units_row(table)
@@ -97,7 +97,7 @@ def parse_csv(text: str) -> pd.DataFrame:
             aliases.setdefault(named[1], column)
     repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
     settings = _comments(text)
-    # Who separates cells by commas hardly writes them in numbers, too.
+    # Files that separate cells by commas hardly use commas in numbers.
     usual = "." if separator == "," else ","
     decimal, undecided = decimal_sign(table, settings.pop("decimal", None), usual)
     table.attrs.update(settings, units=units, aliases=aliases, repeated=repeated)
@@ -110,11 +110,11 @@ def _decoded(content: bytes) -> str:
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return content.decode("utf-16")
     if b"\0" in content:
-        raise ValueError("it holds NUL bytes and is no text")
+        raise ValueError("it contains NUL bytes, so it is not text")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # Of older loggers; there every byte is a letter.
+        # Older loggers use this encoding, in which every byte is a letter.
         return content.decode("latin-1")
 
 
@@ -135,12 +135,12 @@ def _is_comment(line: str) -> bool:
 
 
 def _without_title(lines: list[str]) -> list[str]:
-    """The lines from the header on: titles before it fill one cell of its row."""
+    """The lines from the header on; titles before it fill one cell of their row."""
     row = lines[min(len(lines), MOST_TITLES) - 1]
     separator = next((s for s in _SEPARATORS if s in row), None)
     cells = [[c for c in line.split(separator) if c.strip()] for line in lines[:MOST_TITLES]]
     header = next((k for k, filled in enumerate(cells) if len(filled) > 1), 0)
-    # Below a header of one word come numbers.
+    # A header of one word is followed by numbers.
     numbers = any(is_number(cell.replace(",", ".")) for cell in cells[header])
     return lines if numbers else lines[header:]
 
@@ -149,7 +149,7 @@ def _separator(header: str, rows: list[str]) -> str:
     """The header's separator, unless the rows contradict it."""
     found = next((s for s in _SEPARATORS if s in header), None)
     if found is None:
-        # A header of one word makes a table of one column.
+        # A header of one word gives a table of one column.
         found = " " if len(header.split()) > 1 else ","
     for row in rows:
         # A separator that ranks before the header's cannot be part of a number.
@@ -158,13 +158,13 @@ def _separator(header: str, rows: list[str]) -> str:
         if other is not None and not (found == " " and other == ","):
             raise ValueError(
                 f"its header is separated by {_NAMES[found]}, its rows by {_NAMES[other]}; "
-                "make both alike"
+                "use the same separator"
             )
     return found
 
 
 def _unique(names: Iterable[str]) -> list[str]:
-    """Names made unique as pandas does, but after blanks are stripped."""
+    """Names made unique as in pandas, but after blanks are stripped."""
     found: dict[str, None] = {}
     for name in names:
         own, k = name, 0

@@ -39,11 +39,11 @@ class Item:
     """A table or figure of a paper.
 
     Attributes:
-        title: its number and caption's content.
-        differs: how ours differs from the paper's, if it does.
+        title: its number and the content of its caption.
+        differs: difference between ours and the paper's, if there is one.
         tables: caption and content, by the name of the file.
         figures: by the name of the file.
-        models: whose fits ended as the page then says.
+        models: models whose fits' status the page lists.
     """
 
     title: str
@@ -55,7 +55,7 @@ class Item:
 
 FIRST = (
     Item("Fig. 2: swing from 0°, 20°, 30°, 40° for three cases of inertia",
-         "No full tensor is printed; ours is Izz across and a tenth of it along each link.",
+         "No full tensor is printed; ours has Izz across and a tenth of it along each link.",
          figures={"fig_02_inertia": lambda _: figures.inertia_cases()}),
     Item("Fig. 4: model without friction, an independent simulation and the measured motion",
          "MuJoCo takes the place of SimMechanics, the twin that of the measured motion.",
@@ -68,21 +68,21 @@ FIRST = (
          {"table_6": ("Table 6: classes of acceleration in the experiment", tables.table_6)},
          {"experiment_classes": figures.experiment}),
     Item("Tables 7, 8, 9: adaptive coefficients by class",
-         "The printed ones are lost in the scan. The paper searches by pattern; Gauss-Newton's are "
-         "those from which the papers' networks start.",
+         "The printed ones are lost in the scan. The paper uses pattern search; the papers' "
+         "networks start from the coefficients found by Gauss-Newton.",
          {f"table_{number}": (
              f"Table {number}: coefficients of A{law} by class of acceleration (the print is lost)",
              partial(tables.adaptive_coefficients, law=law))
           for number, law in zip((7, 8, 9), LAWS, strict=True)}),
     Item("Fig. 7 and Table 4: fuzzy sets of joint 2",
          figures={"fig_07_memberships": lambda _: figures.controller_memberships()}),
-    Item("Fig. 8 and Table 5: coefficients that the fuzzy controllers give",
-         "Rules (b) and (c) are lost; all joints have rules (a).",
+    Item("Fig. 8 and Table 5: coefficients from the fuzzy controllers",
+         "Rules (b) and (c) are lost; rules (a) are used for all joints.",
          figures={f"fig_08_surfaces_joint_{joint}":
                   lambda _, joint=joint: controller_surface(paper_controller(joint))  # type: ignore[misc]
                   for joint in (2, 3, 4)}),
     Item("Networks 2-10-2 after their training on the controllers' outputs",
-         "The paper shows none. Controllers here span the coefficients by class of the twin.",
+         "Not shown in the paper. Controllers here span the coefficients by class of the twin.",
          figures={"networks_NFLFM": figures.network_surfaces}, models=("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          "Where a network did not pass its hold-out windows, its constant law is kept.",
@@ -95,9 +95,9 @@ FIRST = (
                   partial(figures.group_positions, models=NEURO_FUZZY[-1:],
                           among=NEURO_FUZZY[-1:])}),
     Item("Table 10: position error of every model",
-         "Another machine's friction: the printed numbers cannot come out. -pattern: by the "
-         "papers' pattern search; -papers: by their fuzzy controller and network. The figure "
-         "shows ten fresh releases: median, middle half and all.",
+         "The printed numbers cannot be reproduced, since the friction is that of another machine. "
+         "-pattern: by the papers' pattern search; -papers: by their fuzzy controller and network. "
+         "The figure shows ten fresh releases: median, middle half and all.",
          {"table_10": (
              "Table 10: position RMSE [mrad] on test releases, free runs, coefficients driven by "
              "the simulated motion", tables.table_10),
@@ -117,7 +117,7 @@ FIRST = (
 )  # fmt: skip
 SECOND = (
     Item("Fig. 3: four joints from 0°, 20°, 30°, 40°",
-         "Counted from hanging, as that paper does.",
+         "Measured from hanging, as in that paper.",
          figures={"second_fig_3_free_arm": lambda _: figures.second_swing()}),
     Item("Tables I, II, III: coefficients", "Coefficients of the twin.",
          {f"second_table_{roman.lower()}": (f"second paper, Table {roman}: {law} by {method}",
@@ -197,16 +197,16 @@ def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
 
 
 def text(workspace: Workspace) -> str:
-    """All tables beside the printed ones, and how the fits ended."""
+    """All tables with the printed values, and the status of the fits."""
     parts = [
         f"{caption}\n"
         + _shown(caption, table).to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
         for caption, table in all_tables(workspace).values()
     ]
     parts.append(
-        "printed: the papers' numbers, from recordings that were never published and another "
-        "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
-        "(fuzzy controller, 2-10-2 network), -pattern: by their pattern search."
+        "printed: the papers' numbers, from recordings that were never published, with the "
+        "friction of another\nmachine; ours: simulated twins. -papers: by the papers' own "
+        "procedure (fuzzy controller, 2-10-2 network),\n-pattern: by their pattern search."
     )
     return "\n\n".join([*parts, f"how the fits ended\n{tables.fit_ends(workspace)}"])
 
@@ -221,7 +221,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
     drawings = {name: draw for item in ITEMS for name, draw in item.figures.items()}
     for name, draw in tqdm(drawings.items(), unit="figure", disable=not progress, leave=False):
         figure, path = draw(workspace), folder / f"{name}.png"
-        # An interrupt must not leave half a picture under the final name.
+        # An interrupt must not leave an incomplete picture under the final name.
         with atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()

@@ -1,8 +1,8 @@
-"""The papers' tables: our numbers beside the printed ones.
+"""The papers' tables: our numbers with the printed ones.
 
-The papers' recordings were never published, so the printed numbers cannot be reproduced to the
-digit: they come from another machine. Units of the position errors are not printed; radians are
-presumed.
+The papers' recordings were never published, so the printed numbers, which come from another
+machine, cannot be reproduced exactly. Units of the position errors are not printed; radians are
+assumed.
 """
 
 import json
@@ -44,19 +44,19 @@ SECOND_TABLE_4: dict[str, list[float]] = _PRINTED["rtip_table_4"]
 NINE = (*LAWS, *ADAPTIVE, *NEURO_FUZZY)
 """Three laws, constant, adaptive and neuro-fuzzy."""
 TLRIP = (*CONSTANT, *ADAPTIVE, *BY_PATTERN, *NEURO_FUZZY, *PAPERS_WAY)
-# The paper's rows are also shown beside those made its own way.
+# The paper's rows are also compared with rows from its own procedure.
 _PRINTED_10 = TABLE_10 | {n: TABLE_10[n.partition("-")[0]] for n in (*BY_PATTERN, *PAPERS_WAY)}
 
 
 class Order(NamedTuple):
     """Verdict on neuro-fuzzy <= adaptive <= constant for each law on every joint.
 
-    By the median error over fresh releases.
+    Judged by the median error over fresh releases.
 
     Attributes:
         holds: true without exceptions.
         broken: exceptions, in words.
-        best: the best of the nine by joint, ties to the digits shown joined by an equals sign.
+        best: the best of the nine by joint; ties in the printed digits are joined by "=".
     """
 
     holds: bool
@@ -79,7 +79,7 @@ def rmse(
     split: str = "test",
     drive: Drive = "free_run",
 ) -> pd.DataFrame:
-    """Position RMSE over all recordings of a split, a row a model, a column a joint [rad]."""
+    """Position RMSE over all recordings of a split, by model (row) and joint (column) [rad]."""
     rows = {}
     for name in models:
         scores = workspace.found(name)["scores"].values()
@@ -91,7 +91,7 @@ def rmse(
 
 
 def fresh(workspace: Workspace, models: Sequence[str] = TLRIP) -> pd.DataFrame:
-    """Median position RMSE of free runs over fresh releases, a row a model [rad]."""
+    """Median position RMSE of free runs over fresh releases, one row per model [rad]."""
     found = fresh_runs(workspace, models)
     return _table({name: np.median(errors, axis=0) for name, errors in found.items()})
 
@@ -104,7 +104,7 @@ def fresh_runs(workspace: Workspace, models: Sequence[str]) -> dict[str, Array]:
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
-    """Position RMSE of every model on test releases, beside the paper's.
+    """Position RMSE of every model on test releases, with the paper's.
 
     References:
         TLRIP paper, Table 10.
@@ -119,7 +119,7 @@ def agreement_table() -> pd.DataFrame:
     References:
         TLRIP paper, Figs. 3 and 4.
     """
-    # 20.56° is counted from hanging.
+    # 20.56° is measured from hanging.
     start = np.deg2rad([200.56, 32.21, 45.0])
     return pd.concat({"ours": agreement(rigs.tlrip(), start, np.zeros(3))}, axis=1)
 
@@ -167,7 +167,7 @@ def adaptive_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 def table_11(workspace: Workspace) -> pd.DataFrame:
     """Error of NFNLFM below that of each other model [%], 11.57 to 94.55 in print.
 
-    The printed side follows from the printed Table 10, which has no constant models.
+    The printed values follow from the printed Table 10, which has no constant models.
 
     References:
         TLRIP paper, Table 11.
@@ -194,7 +194,7 @@ def steps_saved(workspace: Workspace) -> pd.DataFrame:
 
 
 def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """Error of the first model of each pair below the second's, by medians [%], a row a pair."""
+    """Error of the first model of each pair below the second's, from medians [%], by pair."""
 
     def saved(table: pd.DataFrame) -> pd.DataFrame:
         rows = {
@@ -209,7 +209,7 @@ def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.Dat
 
 
 def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
-    """Coefficients of a model on the second paper's rig, beside the paper's.
+    """Coefficients of a model on the second paper's rig, with the paper's.
 
     References:
         RTIP paper, Tables I to III.
@@ -219,7 +219,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 
 
 def second_table_4(workspace: Workspace) -> pd.DataFrame:
-    """Position RMSE on the second paper's rig, beside the paper's.
+    """Position RMSE on the second paper's rig, with the paper's.
 
     References:
         RTIP paper, Table IV.
@@ -252,7 +252,7 @@ def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
 
 def order(workspace: Workspace) -> Order:
     """Verdict on the papers' order of models on fresh releases, joint by joint."""
-    # To the digits shown: a network that was put back computes its law up to rounding.
+    # In the printed digits, because a rejected network equals its law only up to round-off.
     table = (1e3 * fresh(workspace, NINE)).map(lambda e: float(f"{e:.4g}"))
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
     broken = [
@@ -260,10 +260,10 @@ def order(workspace: Workspace) -> Order:
         for law in LAWS
         for better, worse in ((f"A{law}", law), (f"NF{law}", f"A{law}"))
         for joint, e, limit in zip(JOINTS, error[better], error[worse], strict=True)
-        # A diverged simulation is never in order.
+        # A diverged simulation always violates the order.
         if not e <= limit or np.isinf(e)
     ]
-    # Models tie where one was left at the other's coefficients.
+    # Models tie if one kept the other's coefficients.
     best = {
         joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
         for k, joint in enumerate(JOINTS)
@@ -272,7 +272,7 @@ def order(workspace: Workspace) -> Order:
 
 
 def fit_ends(workspace: Workspace) -> str:
-    """The end of every fit in words, and the fits that did not converge."""
+    """The status of every fit, and the fits that did not converge."""
     fits = {name: workspace.found(name)["fit"] for name in (*TLRIP, *SECOND_PAPER)}
     lines = [f"{name:13} {fit['status']}" for name, fit in fits.items()]
     open_ended = _unconverged(workspace)
@@ -292,7 +292,7 @@ def _unconverged(workspace: Workspace) -> list[str]:
 
 
 def conclusion(workspace: Workspace) -> str:
-    """Lines for a stranger to the papers: what was reproduced, what was not, and why."""
+    """Lines for a reader who does not know the papers: claims reproduced or not, and why."""
     error = pd.concat([fresh(workspace), rmse(workspace, SECOND_PAPER)]).mean(axis=1)
 
     def said(names: Sequence[str]) -> str:
@@ -309,30 +309,30 @@ def conclusion(workspace: Workspace) -> str:
     *simple, five = SECOND_PAPER
     missed = workspace.found("twin-tlrip")["missed_torque"]
     lines = [
-        "The papers' claims on simulated recordings, as theirs were never published; errors of the "
-        "simulated position in mrad (median of ten fresh releases of the first rig), of viscous, "
-        "load-dependent and five-coefficient friction:",
+        "The papers' claims on simulated recordings, because theirs were never published; errors "
+        "of the simulated position in mrad (median of ten fresh releases for the first rig) with "
+        "viscous, load-dependent and five-coefficient friction:",
         claim(
             f"coefficients by class of acceleration, {said(ADAPTIVE)} (by the papers' pattern "
-            f"search {said(BY_PATTERN)}), err less than constant ones, {said(constant)}",
+            f"search {said(BY_PATTERN)}), have smaller errors than constant ones, {said(constant)}",
             ADAPTIVE, constant,
         ),
         claim(
-            f"networks fitted to trajectories err less still, {said(NEURO_FUZZY)}",
+            f"networks fitted to trajectories have still smaller errors, {said(NEURO_FUZZY)}",
             NEURO_FUZZY, ADAPTIVE,
         ),
         str(order(workspace)),
         claim(
-            "networks taught by a fuzzy controller, the papers' own way, err less than "
+            "networks taught by a fuzzy controller, the papers' own way, have smaller errors than "
             f"coefficients by class, {said(PAPERS_WAY)}",
             PAPERS_WAY, ADAPTIVE,
         ),
         claim(
-            f"on the second paper's rig five coefficients err least, {said(SECOND_PAPER)}",
+            f"on the second paper's rig five coefficients are best, {said(SECOND_PAPER)}",
             (five,) * len(simple), simple,
         ),
-        f"Why: of the true friction torque a curve over speed misses {missed['speed']:.1%}, one "
-        "over speed and acceleration, all that the papers' networks see, "
+        f"Why: a curve over speed fails to explain {missed['speed']:.1%} of the true friction "
+        "torque, a surface over speed and acceleration, the inputs of the papers' networks, "
         f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
         f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
     ]  # fmt: skip

@@ -50,7 +50,7 @@ def test_the_conclusion_follows_the_errors(tmp_path) -> None:
     assert "on every joint, median of ten fresh releases: no (NFLFM 3200 > ALFM 3000" in lines[3]
     assert lines[4].startswith("best of the nine: joint 2 NFNCFM = NFNLFM, joint 3")
     assert lines[7].startswith("Why: ")
-    assert "misses 25.0%" in lines[7]
+    assert "fails to explain 25.0%" in lines[7]
     assert "12.5%; 1 of 19 fits" in lines[7]
 
 
