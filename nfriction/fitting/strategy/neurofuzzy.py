@@ -1,9 +1,9 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First the law takes further inputs (`inputs`) with which it wins on hold-out windows. Then the network
-trains with fixed sets, and hold-out windows choose the priors. Training continues with the residual
-noise, with the prior of each group of parameters set by evidence, and moves the sets if the
-evidence favours that; this is repeated with ever smaller noise as long as the hold-out windows
+First the law takes further inputs (`inputs`) with which it wins on hold-out windows. Then the
+network trains with fixed sets, and hold-out windows choose the priors. Training continues with the
+residual noise, with the prior of each group of parameters set by evidence, and moves the sets if
+the evidence favours that; this is repeated with ever smaller noise as long as the hold-out windows
 improve. Every window is held out in turn, and a gain has to exceed its scatter over the windows.
 """
 
