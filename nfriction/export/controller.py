@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.heat import Heated
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.sampled import sampled
 from nfriction.io.files import numbers
@@ -64,9 +63,9 @@ def controller_of(
                 "`ModelInfo.sample_time` [s], but it is None."
             )
         model = sampled(model, info.sample_time)
-    if info.sample_time is not None and isinstance(schedule := model.schedule, Heated):
+    if info.sample_time is not None and getattr(model.schedule, "sample_time", None):
         model = copy.deepcopy(model)
-        model.schedule = schedule.at_sample_time(info.sample_time)
+        cast(Any, model.schedule).set_sample_time(info.sample_time)
     if not with_filter:
         return Controller(model, info, torque_limit)
     if info.sample_time is None:

@@ -12,7 +12,6 @@ References:
     O. Reynolds, Phil. Trans. R. Soc. 177 (1886), 157-234, for the viscosity.
 """
 
-import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -90,12 +89,9 @@ class Heated(Schedule):
         self.log_cooling_time.fill_(math.log(positive_number("cooling_time", cooling_time, "s")))
         self.log_sample_time.fill_(math.log(positive_number("sample_time", sample_time, "s")))
 
-    def at_sample_time(self, sample_time: float) -> Schedule:
-        """A copy with the same parameters that advances by another sample time [s]."""
-        moved = copy.copy(self)
-        log_time = torch.full_like(self.log_sample_time, math.log(sample_time))
-        moved._buffers = {**self._buffers, "log_sample_time": log_time}
-        return moved
+    def set_sample_time(self, sample_time: float) -> None:
+        """Set the time between samples [s]."""
+        self.set_heat(self.heat_capacity, self.cooling_time, sample_time)
 
     def take_heat(self, other: "Heated") -> None:
         """Take capacity, cooling time and sample time of another schedule."""

@@ -21,10 +21,10 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     as_stateful,
-    at_sample_time,
 )
 from nfriction.simulation.rollout import simulate
 from nfriction.simulation.validate import (
+    at_sample_time,
     outside_inference_mode,
     require_stability,
     validate_inputs,

@@ -1,11 +1,10 @@
 """Interfaces, inputs and result of a rollout: mechanism, friction, what drives it, the motion."""
 
-import copy
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar, cast
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -72,19 +71,6 @@ def as_stateful(friction: Friction) -> StatefulFriction | None:
     if getattr(friction, "state_size", 0) > 0:
         return cast(StatefulFriction, friction)
     return None
-
-
-Model = TypeVar("Model", bound=Friction)
-
-
-def at_sample_time(friction: Model, sample_time: float) -> Model:
-    """The friction model, or a copy with its parameters whose heat advances by this time [s]."""
-    schedule: Any = getattr(friction, "schedule", None)
-    if not hasattr(schedule, "at_sample_time"):
-        return friction
-    moved: Any = copy.copy(friction)
-    moved._modules = {**moved._modules, "schedule": schedule.at_sample_time(sample_time)}
-    return cast(Model, moved)
 
 
 @dataclass(frozen=True)

@@ -22,16 +22,15 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     StepFunction,
-    at_sample_time,
 )
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
+    at_sample_time,
     outside_inference_mode,
     require_stability,
     validate_inputs,
     validate_measured,
-    warn_of_sample_time,
     with_states,
 )
 
@@ -111,7 +110,6 @@ def rollout(
         return Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
     system = System.of(plant, model)
     require_stability(system, inputs)
-    warn_of_sample_time(model, inputs)
     if gradients is None:
         gradients = backend != "compiled" and wants_gradients(inputs, system.tensors.values())
     states = simulate(system, inputs, gradients, backend, threads)

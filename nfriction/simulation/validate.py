@@ -1,12 +1,13 @@
 """Validation of a rollout's arguments."""
 
+import copy
 import logging
 import math
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import wraps
 from numbers import Integral
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
@@ -251,12 +252,18 @@ def _fastest_decay(system: System) -> float:
     return _decay_rates[key]
 
 
-def warn_of_sample_time(friction: Friction, inputs: RolloutInputs) -> None:
-    """Warn if a hidden state decays at another rate than the model was made for."""
+Model = TypeVar("Model", bound=Friction)
+
+
+def at_sample_time(friction: Model, sample_time: float) -> Model:
+    """The model, or a copy with its parameters whose hidden state advances by this time [s]."""
     meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
-    step = float(inputs.step.mean()) if meant is not None else 0.0
-    if meant is not None and not 0.5 < step / meant < 2.0:
-        logger.warning(
-            "samples of %.3g s advance a hidden state made for %.3g s, so it decays over %.2g "
-            "times its time constant; see `Adaptive.set_sample_time`", step, meant, step / meant,
-        )  # fmt: skip
+    # Clocks jitter, and time constants are known less exactly than to a thousandth.
+    if meant is None or math.isclose(meant, sample_time, rel_tol=1e-3):
+        return friction
+    moved: Any = copy.copy(friction)
+    schedule = copy.copy(moved.schedule)
+    schedule._buffers = {name: x.clone() for name, x in schedule._buffers.items()}
+    schedule.set_sample_time(sample_time)
+    moved._modules = {**moved._modules, "schedule": schedule}
+    return cast(Model, moved)

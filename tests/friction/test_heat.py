@@ -11,6 +11,7 @@ from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelFileError
+from nfriction.simulation.validate import at_sample_time
 from tests.fitting.recordings import pendulum
 from tests.friction.samples import motion, warming_network
 
@@ -98,7 +99,7 @@ def test_heat_follows_the_time_of_samples() -> None:
     assert (found[200] < 1.3 * math.exp(-4.0 / 3.0) * regular[199]).all()
     # At half the rate the same samples last twice as long.
     slow = model.schedule.states(qd, qdd, 2 * time)
-    torch.testing.assert_close(slow, model.schedule.at_sample_time(2 * STEP).states(qd, qdd))
+    torch.testing.assert_close(slow, at_sample_time(model, 2 * STEP).schedule.states(qd, qdd))
     assert (slow[-1] > 1.2 * regular[-1]).all()
 
 

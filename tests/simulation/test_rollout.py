@@ -1,6 +1,7 @@
 """Rollouts: order, energy, passivity, agreement of all executors, gradients, honest errors."""
 
 import logging
+import math
 import re
 from itertools import pairwise
 
@@ -16,7 +17,7 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.simulation.validate import RK4_STABILITY, required_substeps
+from nfriction.simulation.validate import RK4_STABILITY, at_sample_time, required_substeps
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4])
@@ -319,12 +320,14 @@ def test_a_measured_motion_drives_the_memory_too(backend):
     assert not torch.allclose(other.q, free.q, atol=1e-6)
 
 
-def test_a_memory_made_for_other_samples_is_warned_of(caplog):
-    with caplog.at_level(logging.WARNING, "nfriction"):
-        run(named_model("ALFM"), sample_time=5e-4, steps=2)
-        assert not caplog.records
-        run(named_model("ALFM"), sample_time=2e-3, steps=2)
-    assert "set_sample_time" in caplog.text
+def test_a_memory_made_for_other_samples_fades_within_the_same_time():
+    model = named_model("ALFM")
+    made = model.schedule.sample_time
+    other = at_sample_time(model, 2e-3)
+    assert float(other.schedule.fading) == pytest.approx(math.exp(-2e-3 / 2.0))
+    assert model.schedule.sample_time == made
+    assert other.schedule.raw is model.schedule.raw
+    assert at_sample_time(model, 1.0001 * made) is model
 
 
 def test_a_memory_must_fit_the_model():

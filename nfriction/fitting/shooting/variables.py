@@ -15,7 +15,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
-from nfriction.simulation.protocols import at_sample_time
+from nfriction.simulation.validate import at_sample_time
 
 
 def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
@@ -27,7 +27,7 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 
 def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
     """A friction model for simulations that count substeps as samples."""
-    sample_time = getattr(model.schedule, "sample_time", math.nan)
+    sample_time = getattr(model.schedule, "sample_time", None) or math.nan
     return at_sample_time(model, sample_time / substeps)
 
 
