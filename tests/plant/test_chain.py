@@ -330,7 +330,7 @@ def test_chain_formula_of_the_multiarm_bench() -> None:
         ({"com": [0.5, 0.0]}, "positive definite"),
         ({"inertia": [1.0, 1.0, 1.0]}, "`inertia` must be None"),
         ({"inertia": [0.0, -0.5]}, "positive definite"),
-        ({"gravity": 0.0}, "`gravity` must be at least 1e-06"),
+        ({"gravity": 0.0}, "`gravity` must be at least 1e-06.*write 1e-06 .*rotor"),
         ({"gravity": 5e-324}, "`gravity` must be at least 1e-06"),
         ({"armature": [0.0, -1.0]}, "`armature` must not be negative"),
         ({"convention": ("absolute", "down")}, "`convention` must be"),
