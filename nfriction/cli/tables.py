@@ -71,12 +71,10 @@ def _with_si(name: str, plant: Plant) -> str:
 
 
 def interval_table(fit: FitResult) -> str:
-    """Values and 95 % intervals of constant coefficients and of the plant's terms; may be empty."""
+    """Values and 95 % intervals of constant coefficients and the plant's terms; empty of others."""
     rows = [(_with_si(i.name, fit.plant), i.value, i.low, i.high) for i in fit.intervals]
-    # Only constant coefficients have intervals.
-    if not rows:
-        return ""
-    return str(tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms)))
+    table = tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms))
+    return str(table) if rows else ""
 
 
 def choice(selection: Selection) -> str:

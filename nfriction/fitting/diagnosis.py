@@ -210,10 +210,8 @@ def _odd_one_out(
     a correction explains it, or inertia, gravity and zeros of its own with the friction of all.
     """
     few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(recordings)))
-    alone = [
-        _unexplained(plant, _collect([r], [m], few))
-        for r, m in zip(recordings, motions, strict=True)
-    ]
+    pairs = zip(recordings, motions, strict=True)
+    alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
     odd = int(np.argmax(np.nan_to_num(alone, nan=-1.0)))
     name = recordings[odd].name or f"recording {odd + 1}"
     order = sorted(range(len(alone)), key=lambda k: k != odd)
