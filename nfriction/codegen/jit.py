@@ -70,7 +70,11 @@ def build(source: str, name: str) -> Callable[..., None]:
 
     recipe = (source, llvm.get_process_triple(), *_processor(), _version(), str(EFFORT))
     key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
-    folder = _usable_folder()
+    folder = None
+    try:
+        folder = cache_folder()
+    except (OSError, RuntimeError) as error:  # a RuntimeError where there is no home folder
+        _warn_not_kept(str(error))
     code = _kept(folder, key) if folder else None
     if code is None:
         code = _compile(source)
@@ -97,14 +101,6 @@ def _find_library(llvm: Any) -> None:
             for name in names:
                 function = ctypes.CDLL(library)[name]
                 llvm.add_symbol(name, ctypes.cast(function, ctypes.c_void_p).value)
-
-
-def _usable_folder() -> Path | None:
-    try:
-        return cache_folder()
-    except (OSError, RuntimeError) as error:  # a RuntimeError where there is no home folder
-        _warn_not_kept(str(error))
-    return None
 
 
 @cache

@@ -77,10 +77,6 @@ def numbers(g: Graph, op: str, *operands: Any) -> Nodes:
     return elementwise(g, lambda *xs: g.apply(op, *(number(g, x) for x in xs)), *operands)
 
 
-def _register_pointwise(aten: str, op: str) -> None:
-    OPERATIONS[aten] = lambda g, *xs: numbers(g, op, *xs)
-
-
 for _aten, _op in {
     **{
         name: name
@@ -93,17 +89,12 @@ for _aten, _op in {
     "maximum": "max",
     "minimum": "min",
 }.items():
-    _register_pointwise(_aten, _op)
+    OPERATIONS[_aten] = lambda g, *xs, op=_op: numbers(g, op, *xs)
 
 
 @handles("add")
 def add(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
     return numbers(g, "add", a, numbers(g, "mul", b, alpha))
-
-
-@handles("sub")
-def sub(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
-    return numbers(g, "sub", a, numbers(g, "mul", b, alpha))
 
 
 @handles("div")
@@ -157,12 +148,6 @@ def _logical(op: str) -> Operation:
     return apply
 
 
-OPERATIONS["logical_and"] = _logical("and")
-OPERATIONS["logical_or"] = _logical("or")
-OPERATIONS["logical_xor"] = _logical("ne")
-OPERATIONS["logical_not"] = _logical("not")
-
-
 def _bitwise(name: str, op: str) -> None:
     def apply(g: Graph, *operands: Any) -> Nodes:
         if not all(is_predicate(x) for a in operands for x in as_nodes(g, a).flat):
@@ -173,6 +158,7 @@ def _bitwise(name: str, op: str) -> None:
 
 
 for _aten, _op in {"and": "and", "or": "or", "xor": "ne", "not": "not"}.items():
+    OPERATIONS[f"logical_{_aten}"] = _logical(_op)
     _bitwise(f"bitwise_{_aten}", _op)
 
 
@@ -194,11 +180,6 @@ def _sum(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -
     return _reduce(g, g.total, a, dim, keepdim)
 
 
-@handles("mean")
-def _mean(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
-    return _reduce(g, lambda xs: g.apply("div", g.total(xs), g.constant(len(xs))), a, dim, keepdim)
-
-
 def _extreme(op: str) -> Operation:
     def extreme(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
         if isinstance(dim, int):
@@ -216,7 +197,7 @@ OPERATIONS["amin"] = OPERATIONS["min"] = _extreme("min")
 
 @handles("_softmax")
 def _softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
-    exps = numbers(g, "exp", sub(g, a, _amax(g, a, [dim], True)))
+    exps = numbers(g, "exp", numbers(g, "sub", a, _amax(g, a, [dim], True)))
     return numbers(g, "mul", exps, div(g, 1.0, _sum(g, exps, dim, True)))
 
 
@@ -270,35 +251,11 @@ def _view(g: Graph, a: Nodes, size: Sequence[int], *_: Any) -> Nodes:
     return out
 
 
-@handles("expand")
-def _expand(g: Graph, a: Nodes, size: Sequence[int], implicit: bool = False) -> Nodes:
-    lead = len(size) - a.ndim
-    return np.broadcast_to(a, [a.shape[i - lead] if n == -1 else n for i, n in enumerate(size)])
-
-
-@handles("select")
-def _select(g: Graph, a: Nodes, dim: int, index: int) -> Nodes:
-    return np.moveaxis(a, dim, 0)[int(index), ...]
-
-
-@handles("slice")
-def _slice(
-    g: Graph, a: Nodes, dim: int = 0, start: Any = None, end: Any = None, step: int = 1
-) -> Nodes:
-    return np.moveaxis(np.moveaxis(a, dim, 0)[start:end:step], 0, dim)
-
-
 @handles("squeeze")
 def _squeeze(g: Graph, a: Nodes, dim: Any = None) -> Nodes:
     dims = range(a.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
     axes = tuple(d % a.ndim for d in dims if a.ndim and a.shape[d] == 1)
     return a.squeeze(axes)
-
-
-@handles("split_with_sizes")
-def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) -> list[Nodes]:
-    stops = np.cumsum(sizes)
-    return [_slice(g, a, dim, s - n, s) for s, n in zip(stops, sizes, strict=True)]
 
 
 @handles("constant_pad_nd")
@@ -320,11 +277,6 @@ def _subscript(name: str, indices: Sequence[Nodes | None]) -> tuple[Any, ...]:
     return tuple(slice(None) if i is None else _static(name, i) for i in indices)
 
 
-@handles("index", "_unsafe_index")
-def _index(g: Graph, a: Nodes, indices: Sequence[Nodes | None]) -> Nodes:
-    return as_nodes(g, a[_subscript("index", indices)])
-
-
 @handles("index_put")
 def _index_put(
     g: Graph, a: Nodes, indices: Sequence[Nodes | None], values: Nodes, accumulate: bool = False
@@ -334,16 +286,6 @@ def _index_put(
     out = a.copy()
     out[_subscript("index_put", indices)] = values
     return out
-
-
-@handles("gather")
-def _gather(g: Graph, a: Nodes, dim: int, index: Nodes, sparse_grad: bool = False) -> Nodes:
-    return np.take_along_axis(a, _static("gather", index), axis=dim)
-
-
-def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
-    # torch ignores the historic empty 1-D tensor.
-    return np.concatenate([t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim)
 
 
 # All that is one expression.
@@ -358,9 +300,13 @@ OPERATIONS |= {
     "reciprocal": lambda g, a: div(g, 1.0, a),
     "relu": lambda g, a: numbers(g, "max", a, 0.0),
     "rsqrt": lambda g, a: div(g, 1.0, numbers(g, "sqrt", a)),
+    "mean": lambda g, a, dim=None, keepdim=False, **_: _reduce(
+        g, lambda xs: g.apply("div", g.total(xs), g.constant(len(xs))), a, dim, keepdim
+    ),
     "prod": lambda g, a, dim=None, keepdim=False, **_: _reduce(
         g, lambda xs: g.total(xs, "mul"), a, dim, keepdim
     ),
+    "sub": lambda g, a, b, alpha=1: numbers(g, "sub", a, numbers(g, "mul", b, alpha)),
     "sigmoid": lambda g, a: div(g, 1.0, add(g, 1.0, numbers(g, "exp", numbers(g, "neg", a)))),
     **dict.fromkeys(
         ("sign", "sgn"),
@@ -386,16 +332,34 @@ OPERATIONS |= {
         lambda g, a, size=None, **_: _full(g, a, size, 0.0),
     ),
     **dict.fromkeys(("ones_like", "new_ones"), lambda g, a, size=None, **_: _full(g, a, size, 1.0)),
-    "cat": _cat,
+    # torch ignores the historic empty 1-D tensor.
+    "cat": lambda g, tensors, dim=0: np.concatenate(
+        [t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim
+    ),
+    "gather": lambda g, a, dim, index, sparse_grad=False: np.take_along_axis(
+        a, _static("gather", index), axis=dim
+    ),
     # Read-only: writing through it is refused.
     "diagonal": lambda g, a, offset=0, dim1=0, dim2=1: np.diagonal(a, offset, dim1, dim2),
     "transpose": lambda g, a, dim0, dim1: a.swapaxes(dim0, dim1) if a.ndim else a,
-    "unbind": lambda g, a, dim=0: [_select(g, a, dim, i) for i in range(a.shape[dim])],
+    "expand": lambda g, a, size, implicit=False: np.broadcast_to(
+        a, [a.shape[i - len(size) + a.ndim] if n == -1 else n for i, n in enumerate(size)]
+    ),
+    "select": lambda g, a, dim, index: np.moveaxis(a, dim, 0)[int(index), ...],
+    "slice": lambda g, a, dim=0, start=None, end=None, step=1: np.moveaxis(
+        np.moveaxis(a, dim, 0)[start:end:step], 0, dim
+    ),
+    "split_with_sizes": lambda g, a, sizes, dim=0: np.split(a, np.cumsum(sizes)[:-1], dim),
+    "unbind": lambda g, a, dim=0: [np.moveaxis(a, dim, 0)[i, ...] for i in range(a.shape[dim])],
     "flip": lambda g, a, dims: np.flip(a, tuple(dims)).copy(),
     "permute": lambda g, a, dims: a.transpose([d % a.ndim for d in dims]),
     "repeat": lambda g, a, repeats: np.tile(a, tuple(repeats)),
     "stack": lambda g, tensors, dim=0: np.stack(tensors, axis=dim),
     "unsqueeze": lambda g, a, dim: np.expand_dims(a, dim),
+    **dict.fromkeys(
+        ("index", "_unsafe_index"),
+        lambda g, a, indices: as_nodes(g, a[_subscript("index", indices)]),
+    ),
     **dict.fromkeys(("t", "numpy_T"), lambda g, a: a.T),
     **dict.fromkeys(("alias", "detach"), lambda g, a: a),
     **dict.fromkeys(

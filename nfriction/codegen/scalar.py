@@ -72,29 +72,21 @@ EVALUATE: dict[str, Callable[..., Any]] = {
         name: getattr(np, name)
         for name in (
             *("abs", "sqrt", "exp", "expm1", "log", "log1p", "floor", "ceil", "trunc", "fmod"),
-            *("sin", "cos", "tan", "sinh", "cosh", "tanh", "where"),
+            *("sin", "cos", "tan", "sinh", "cosh", "tanh", "where", "add"),
         )
     },
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "pow": np.power,
-    "atan2": np.arctan2,
-    "max": np.maximum,  # both propagate NaN, as torch does
-    "min": np.minimum,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "lt": np.less,
-    "le": np.less_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "not": np.logical_not,
-}
+    **{
+        name: getattr(np, ufunc)
+        for name, ufunc in {
+            "sub": "subtract", "mul": "multiply", "div": "divide", "neg": "negative",
+            "pow": "power", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
+            "atan2": "arctan2", "lt": "less", "le": "less_equal", "eq": "equal",
+            "ne": "not_equal", "and": "logical_and", "or": "logical_or", "not": "logical_not",
+            # Both propagate NaN, as torch does.
+            "max": "maximum", "min": "minimum",
+        }.items()
+    },
+}  # fmt: skip
 
 PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})

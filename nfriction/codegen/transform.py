@@ -55,9 +55,7 @@ def tangents(graph: Graph, nodes: Iterable[Node], seed: Tangents) -> dict[int, N
 
 
 def _add(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
-    if da is None or db is None:
-        return _one(da, db)
-    return g.apply("add", da, db)
+    return g.total([d for d in (da, db) if d is not None])
 
 
 def _sub(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
@@ -113,11 +111,6 @@ def _one(*candidates: Node | None) -> Node:
     return next(c for c in candidates if c is not None)
 
 
-def _abs_slope(g: Graph, a: Node, value: Node) -> Node:
-    negative = g.apply("lt", a, g.constant(0.0))
-    return g.apply("where", negative, g.constant(-1.0), g.constant(1.0))
-
-
 _RULES: dict[str, Rule] = {
     "add": _add,
     "sub": _sub,
@@ -127,7 +120,11 @@ _RULES: dict[str, Rule] = {
     "max": _select("max"),
     "min": _select("min"),
     "neg": lambda g, node, da: g.apply("neg", da),
-    "abs": _chain(_abs_slope),
+    "abs": _chain(
+        lambda g, a, _: g.apply(
+            "where", g.apply("lt", a, g.constant(0.0)), g.constant(-1.0), g.constant(1.0)
+        )
+    ),
     "sqrt": _chain(lambda g, a, value: g.apply("div", g.constant(0.5), value)),
     "exp": _chain(lambda g, a, value: value),
     "log": _chain(lambda g, a, value: g.apply("div", g.constant(1.0), a)),

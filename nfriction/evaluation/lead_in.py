@@ -23,7 +23,7 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
 from nfriction.recording import Recording
-from nfriction.signals import Motion, causal_motion, count_seen
+from nfriction.signals import causal_motion, count_seen
 from nfriction.simulation.rollout import Scheme, rollout
 from nfriction.simulation.validate import required_substeps
 
@@ -163,7 +163,10 @@ class Simulator:
         self.law_states: torch.Tensor | None = None
         # Hidden states as of a controller at every sample, from which windows continue.
         if friction is not None and (friction.state_size or friction.law.memory):
-            motion = _causal_motion(plant, recording)
+            joint, quantum = recording.joint_coordinates(plant), plant.position_quantum
+            counts = math.tau / (quantum or np.finfo(np.float64).eps)
+            cutoff = min(CUTOFF, 0.2 / joint.sample_time)
+            motion = causal_motion(joint.time, joint.q, counts, cutoff)
             q, qd, qdd = (torch.tensor(x) for x in (motion.q, motion.qd, motion.qdd))
             if friction.state_size:
                 self.states = friction.schedule.states(qd, qdd, torch.tensor(self.time))
@@ -477,14 +480,6 @@ def _noise(y: Array, quantum: float | Array) -> Array:
     seen = np.where(seen > 0, seen, seen.max(axis=-1, keepdims=True))
     least = quantum / math.sqrt(12)
     return np.maximum(seen, np.maximum(least, 1e-12 * np.maximum(np.abs(y).max(axis=1), 1.0)))
-
-
-def _causal_motion(plant: Plant, recording: Recording) -> Motion:
-    """The motion in joint coordinates as a controller estimates it."""
-    joint = recording.joint_coordinates(plant)
-    quantum = plant.position_quantum or np.finfo(np.float64).eps
-    cutoff = min(CUTOFF, 0.2 / joint.sample_time)
-    return causal_motion(joint.time, joint.q, math.tau / quantum, cutoff)
 
 
 def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording) -> int | None:

@@ -13,7 +13,7 @@ outside `input_ranges`.
 import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import torch

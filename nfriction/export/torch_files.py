@@ -287,11 +287,7 @@ def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[
 # Programs keep the names of their arguments, so that each kind of controller has its own.
 
 
-class _Program(nn.Module):
-    def __init__(self, controller: Controller) -> None:
-        super().__init__()
-        self.controller = controller
-
+class _Program(_Host):
     def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Any:
         return self.controller(qd, qdd, load)
 

@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import adjusted_buffers
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.paired_test import gains, student_quantile
@@ -121,7 +122,8 @@ def likely_mistakes(
     tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
     # With different zeros, recordings of the same rig have different balances.
     if len(recordings) > 1 and not zeroed:
-        tested.append(_odd_one_out(plant, recordings, motions, options))
+        most = sound / options.diagnosis_ratio
+        tested += _odd_one_out(plant, recordings, motions, convention, most, options)
     found = [
         Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
     ]
@@ -195,18 +197,42 @@ def _tested(
 
 
 def _odd_one_out(
-    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
-) -> tuple[str, float]:
-    """The recording that friction explains worst, and the unexplained share of the others."""
-    pairs = list(zip(recordings, motions, strict=True))
-    few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(pairs)))
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    convention: AngleConvention,
+    most: float,
+    options: FitOptions,
+) -> Iterator[tuple[str, float]]:
+    """The recording that friction of its own explains worst, if the others leave at most this.
+
+    Friction may change between recordings, and lively motion leaves more: this one is odd only if
+    a correction explains it, or inertia, gravity and zeros of its own with the friction of all.
+    """
+    few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(recordings)))
+    pairs = zip(recordings, motions, strict=True)
     alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
     odd = int(np.argmax(np.nan_to_num(alone, nan=-1.0)))
     name = recordings[odd].name or f"recording {odd + 1}"
-    del pairs[odd]
-    others = _collect([r for r, _ in pairs], [m for _, m in pairs], options)
-    text = f"{name} is from another rig than the others, or was recorded differently"
-    return text, _unexplained(plant, others)
+    order = sorted(range(len(alone)), key=lambda k: k != odd)
+    recordings, motions = [recordings[k] for k in order], [motions[k] for k in order]
+    share = _unexplained(plant, _collect(recordings[1:], motions[1:], options))
+    if share >= most:
+        return
+    _, causes = likely_mistakes(plant, recordings[:1], motions[:1], convention, few)
+    data = _collect(recordings, motions, options)
+    # Time starts again where the first one ends.
+    own = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0) == 0
+    driven = np.flatnonzero(data.tau.abs().amax(0)).tolist()
+    rig, needed = [], data.needed(plant)
+    for term in plant_parameters(plant, driven=driven, options=options):
+        if term.ratio or term.name.startswith("angle offset"):
+            # Of the torque that a small change of the term takes, only the shape matters.
+            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
+            rig.append(own * (data.needed(plant.replace(**changed)) - needed))
+    if causes or (rig and _unexplained(plant, data, torch.stack(rig, -1)) < most):
+        text = f"{name} is from another rig than the others, or was recorded differently"
+        yield text + f" ({', or '.join(x.text for x in causes)})" * bool(causes), share
 
 
 def _collect(
@@ -440,7 +466,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[str]:
-    """A sentence for each driven joint whose friction grows or falls during the recordings.
+    """A sentence for each driven joint whose friction grows or falls, during recordings or between.
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay must not appear as a change:
     friction may be any function of speed plus a share of the torque, and the rig is fitted as well.
@@ -450,28 +476,37 @@ def changing_friction(
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
+    time = data.mean(data.time)
+    # Time starts again with each recording.
+    number = (time.diff(dim=0, prepend=time[:1]) < 0).cumsum(0).to(time)
+    clocks = {"during a recording": time, "from the first recording to the last": number}
     for j in np.flatnonzero(data.tau.abs().amax(0)).tolist():
         friction, of_rig, sliding = _of_sliding(plant, data, j, options)
         if (count := int(sliding.sum())) < 2 * pieces:
             continue
-        means = friction, of_rig, data.mean(data.tau[:, [j]]), data.mean(data.time)
+        means = friction, of_rig, data.mean(data.tau[:, [j]])
         terms = [x[sliding] for x in means]
         if not all(bool(x.isfinite().all()) for x in terms):
             continue
-        # Per time of sliding, in pieces that all contain some: rest shows nothing.
-        terms[-1] = terms[-1] / (terms[-1].max() - terms[-1].min())
         piece = torch.arange(count) * pieces // count
-        change = 100 * _growth(piece < 0, *terms)[0]
-        found = [_growth(piece == k, *terms) for k in range(pieces)]
-        sd = 100 * math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
-        constant, growing = torch.stack([squares for _, squares in found]).T
-        known = abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
-        if known and gains(growing, constant, options.drift_chance):
-            yield (
-                f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} by "
-                f"{abs(change):.2g} % (within {sd * student_quantile(pieces - 1, 0.975):.2g} %) "
-                "during a recording (warm-up, payload); the intervals do not cover this."
-            )
+        for period, clock in clocks.items():
+            # Per time of sliding, in pieces that all contain some: rest shows nothing.
+            span = clock[sliding].max() - clock[sliding].min()
+            if span == 0:
+                continue
+            given = [*terms, clock[sliding] / span]
+            change = 100 * _growth(piece < 0, *given)[0]
+            found = [_growth(piece == k, *given) for k in range(pieces)]
+            sd = 100 * math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
+            constant, growing = torch.stack([squares for _, squares in found]).T
+            known = abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
+            if known and gains(growing, constant, options.drift_chance):
+                yield (
+                    f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} "
+                    f"by {float(f'{abs(change):.2g}'):g} % (within "
+                    f"{sd * student_quantile(pieces - 1, 0.975):.2g} %) {period} (warm-up, "
+                    "payload); the intervals do not cover this."
+                )
 
 
 def loose_loads(
@@ -554,10 +589,10 @@ def _growth(
     returns the sums of squared torque errors of constant and growing friction on blocks left out.
     """
     known, seen = torch.cat([friction, of_rig], 1), ~left_out
-    constant = torch.linalg.lstsq(known[seen], torque[seen]).solution
+    constant = torch.linalg.lstsq(known[seen], torque[seen], driver="gelsd").solution
     growing = (time - time[seen].mean()) * (friction @ constant[: friction.shape[1]])
     terms = torch.cat([known, growing], 1)
-    found = torch.linalg.lstsq(terms[seen], torque[seen]).solution
+    found = torch.linalg.lstsq(terms[seen], torque[seen], driver="gelsd").solution
     missed = [torque - known @ constant, torque - terms @ found]
     return float(found[-1]), torch.stack([x[left_out].square().sum() for x in missed])
 
@@ -625,14 +660,14 @@ def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
     return _balance(given, given.tau - needed, needed - given.needed(moved))[1]
 
 
-def _unexplained(plant: Plant, data: _Data) -> float:
-    """Share of the torque that Coulomb and viscous friction do not explain [-].
+def _unexplained(plant: Plant, data: _Data, extra: Tensor | None = None) -> float:
+    """Share of the torque that Coulomb and viscous friction, and `extra`, do not explain [-].
 
     Root mean square over joints, relative to the sum of squares of the torques of drive, gravity
     and inertia.
     """
     needed, rest = data.needed(plant), torch.zeros_like(data.q)
-    target = _balance(data, data.tau - needed)[0]
+    target = _balance(data, data.tau - needed, extra)[0]
     static = plant.inverse_dynamics(data.q, rest, rest)
     parts = data.tau, static, needed - static
     size = torch.stack([(data.moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
@@ -640,13 +675,15 @@ def _unexplained(plant: Plant, data: _Data) -> float:
 
 
 def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, float]:
-    """Mean square of unexplained torque, (joint,), and the factor of an `extra` torque."""
+    """Mean square of unexplained torque, (joint,), and the factor of the first `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
     left = data.moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
-    own = [] if extra is None else [-(data.moving * data.mean(extra))[..., None]]
+    own = []
+    if extra is not None:
+        own.append(-data.moving[..., None] * data.mean(extra.reshape(*data.q.shape, -1)))
     # A drive may have an offset.
     offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]
     free = torch.cat([*own, offsets], -1)

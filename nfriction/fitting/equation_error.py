@@ -127,7 +127,7 @@ class TorqueBalance:
         """Torques (sample, joint, any) filtered as by the smoother."""
         if self.rate is None:
             return x
-        parts = []
+        found = x.clone()
         for first, last in self.segments:
             part = x[first : last + 1]
             # Mirrored, so that the ends meet.
@@ -135,8 +135,8 @@ class TorqueBalance:
             frequency = 2 * math.pi * torch.fft.rfftfreq(2 * len(part), self.step)
             gain = 1 / (1 + (frequency[:, None] / self.rate) ** 8)
             back = torch.fft.irfft(spectrum * gain[..., None], n=2 * len(part), dim=0)
-            parts.append(back[: len(part)])
-        return torch.cat(parts)
+            found[first : last + 1] = back[: len(part)]
+        return found
 
 
 def _balance(

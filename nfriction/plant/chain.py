@@ -47,8 +47,7 @@ def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
     if gravity < WEIGHTLESS:
         raise ValueError(
             f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; write "
-            f"{WEIGHTLESS:g} for links in a horizontal plane (one such joint alone: a rig of kind "
-            "rotor)."
+            f"{WEIGHTLESS:g} for links in a horizontal plane (one joint alone: the kind rotor)."
         )
     if not isinstance(arm, Arm | None):
         raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")

@@ -105,7 +105,8 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
         position, below = axes[2 * joint, 0], axes[2 * joint + 1, 0]
         position.plot(recording.time, measured, **style.MEASURED)
         errors = {n: s.simulated[:, joint] - measured for n, s in scores.items()}
-        shown = min(max(_largest(e) for n, e in errors.items() if n in whole), 0.5 * span) or span
+        seen = np.abs([e for n, e in errors.items() if n in whole])
+        shown = min(np.max(seen, where=np.isfinite(seen), initial=0.0), 0.5 * span) or span
         factor, unit = 1e3, f"m{recording.unit}"  # as in every table
         for model, error in errors.items():
             position.plot(recording.time, scores[model].simulated[:, joint], **looks[model].line)
@@ -279,10 +280,6 @@ def _check_same_recording(recording: Recording, scores: Mapping[str, Score]) -> 
                 f"the score of {name!r} has simulated positions {score.simulated.shape}, the "
                 f"recording {recording.q.shape}; scores must be of the same recording."
             )
-
-
-def _largest(error: np.ndarray) -> float:
-    return float(np.max(np.abs(error), where=np.isfinite(error), initial=0.0))
 
 
 def _label(name: str, score: Score) -> str:

@@ -4,15 +4,18 @@ import argparse
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from nfriction import cli, friction, rigs
+from nfriction import CVFM, PendulumChain, cli, friction, rigs
 from nfriction.cli import inputs
 from nfriction.cli.console import Progress
+from nfriction.cli.tables import interval_table
 from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.model_file import save
 from tests.cli.benches import compare, pendulum, results
 
@@ -286,4 +289,22 @@ def test_progress_counts_stages_and_estimates_the_time_left(
         "nfriction: 1 of 4: fit CVFM, 2 s windows, step 1 (12 s)",
         "nfriction: 2 of 4: fit NFCVFM, 0.5 s windows, step 1 (30 s, about 15 s left)",
         "nfriction: 2 of 4: fit NFCVFM, 2 s windows, step 2 (50 s)",
+    ]
+
+
+def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
+    plant = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], armature=[0.01, 0.02])
+    names = "F_c of joint1", "inertia 22", "gravity 2", "armature 2", "length 1"
+    intervals = [Interval(name, 0.0, -0.1, 0.1) for name in names]
+    fit = SimpleNamespace(
+        plant=plant, model=CVFM(2), intervals=intervals, plant_terms=[("inertia 22", 0.0, 0.3)]
+    )
+    said = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
+    inertia, moment = float(plant.inertia_coupling[1, 1]), float(plant.gravity_moment[1])
+    assert said == [
+        "F_c of joint1",
+        f"inertia 22 ({inertia:.4g} kg m^2)",
+        f"gravity 2 ({moment:.4g} N m)",
+        "armature 2 (0.02 kg m^2)",
+        "length 1",
     ]

@@ -414,22 +414,50 @@ def test_an_elastic_joint_is_named_and_doubtful():
     assert replace(found, converged=False).usability[0] == "do not use"
 
 
-def test_a_recording_of_another_rig_is_named():
-    plant, q, tau = measured("motor")
-    heavy = plant.replace(gravity_moment=2 * plant.gravity_moment)
+def of_several_days(rig: Plant, friction: list[float]) -> list[Recording]:
+    """Two recordings of the motor, and one of this rig with this friction."""
+    _, q, tau = measured("motor")
     start = torch.tensor([math.pi], dtype=torch.float64)
     other = rollout(
-        heavy, CVFM(1, [[0.8, 0.3]]).requires_grad_(False), start, 0 * start, sample_time=STEP,
+        rig, CVFM(1, [friction]).requires_grad_(False), start, 0 * start, sample_time=STEP,
         steps=SAMPLES - 1, substeps=8, tau=torch.as_tensor(tau[:-1]),
     )  # fmt: skip
     files = {"monday": q, "tuesday": q + 2e-3 * np.sin(q), "other": other.q.numpy()}
-    recordings = [
+    return [
         Recording(STEP * np.arange(SAMPLES), x, tau, convention="relative,upright", name=name)
         for name, x in files.items()
     ]
-    found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
-    assert found == ("other is from another rig than the others, or was recorded differently",)
+
+
+def test_a_recording_of_another_rig_is_named():
+    plant = measured("motor")[0]
+    recordings = of_several_days(plant.replace(gravity_moment=2 * plant.gravity_moment), [0.8, 0.3])
+    (found,) = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
+    of = "other is from another rig than the others, or was recorded differently"
+    assert re.fullmatch(rf"{of} \(gravity 1 is 2\.0\d times that of the rig\)", found)
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
+
+
+@pytest.mark.parametrize(("factor", "change"), [(3.0, "grows"), (0.5, "falls")])
+def test_friction_that_changes_between_recordings_is_of_no_other_rig(factor, change):
+    plant = measured("motor")[0]
+    recordings = of_several_days(plant, [0.3 * factor, 0.12 * factor])
+    for given in (recordings, recordings[1:]):
+        task = prepare_task(CVFM(1), plant, given, FitOptions())
+        assert not task.mistakes
+        (found,) = task.unmodelled
+        assert re.match(rf"The friction of joint1 {change} by \d+ % .* to the last", found)
+
+
+def test_friction_that_differs_between_free_swings_is_of_no_other_rig():
+    plant = pendulum()
+    models = [CVFM(2, f * np.array([[0.01, 4e-3], [4e-3, 2e-3]]), v_smooth=0.01) for f in (1, 3)]
+    starts = (1.6, 0.8), (1.2, 1.0)
+    made = [
+        swing(plant, model.requires_grad_(False), start=start, seconds=6.0)
+        for model, start in zip(models, starts, strict=True)
+    ]
+    assert not prepare_task(CVFM(2), plant, made, FitOptions()).mistakes
 
 
 def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():

@@ -100,6 +100,7 @@ def test_a_driven_axis_gives_mass_and_offset():
     found = fit(LFM(1, v_smooth=V_SMOOTH), LinearAxis(1.9), recording, windows=(0.5,))
     assert float(found.plant.mass) == pytest.approx(2.0, rel=0.01)
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
+    assert not any("times the speed" in warning for warning in found.warnings)
     values = found.model.schedule.values[0].tolist()
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
 
@@ -161,6 +162,10 @@ def test_an_asymmetric_axis_is_told_from_its_offset():
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
     assert float(found.plant.asymmetry) == pytest.approx(0.8, rel=0.1)
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
+    (told,) = (w for w in found.warnings if "times the speed" in w)
+    assert "a drive force of -0." in told
+    assert "larger forwards" in told
+    assert not any("constant drive" in w for w in found.warnings)
 
 
 def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():

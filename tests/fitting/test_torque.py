@@ -146,6 +146,21 @@ def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
     assert any("blurs friction at low speed" in warning for warning in found.warnings)
 
 
+@pytest.mark.parametrize("alone", [0, -1])
+def test_a_sample_alone_beside_a_gap_does_no_harm(alone):
+    recording = flywheel(3, Stribeck(1, [0.35, 0.15, 0.12, 0.3, 2.0]))
+    time = recording.time.copy()
+    time[alone] += -1.0 if alone == 0 else 1.0
+    with pytest.warns(match="has gaps"):
+        gapped = Recording(time, recording.q, recording.tau, unit="m")
+    whole, found = (
+        fit("CVFM", LinearAxis(0.13), r, method="equation_error") for r in (recording, gapped)
+    )
+    assert found.model.schedule.values[0].tolist() == pytest.approx(
+        whole.model.schedule.values[0].tolist(), rel=0.01
+    )
+
+
 def test_a_regression_names_what_it_found_none_of():
     plant = pendulum()
     model = model_by_name("CVFM")(2, [[3e-3, 0.0], [5e-4, 1e-3]], v_smooth=V_SMOOTH)

@@ -445,6 +445,16 @@ def test_all_models_are_told_apart_by_marker_and_by_dashes():
     )
 
 
+def test_dashes_hide_no_equal_curve_in_whatever_order():
+    looks = style.looks(["CVFM", "NFCVFM", "LFM", "NFLFM", "NLFM", "NFNLFM"])
+    whole = [x.line["zorder"] for x in looks.values() if x.line["linestyle"] == "-"]
+    assert len(whole) == 2
+    dashed = [look.line["zorder"] for name, look in looks.items() if name in ("NFCVFM", "NFNLFM")]
+    assert max(whole) < min(dashed)
+    # It fades away behind all models.
+    assert looks["no friction"].line["zorder"] < min(dashed)
+
+
 def test_a_motor_is_drawn_with_its_data_in_no_frame():
     figure = plots.mechanism(Rotor(0.02, motor=Motor(50, 1.2e-5, 0.03), name="wheel"))
     wheel, words = figure.axes

@@ -423,6 +423,13 @@ def test_gaps_are_noticed_and_jitter_is_not() -> None:
         Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
 
 
+def test_stamps_of_packets_are_told_from_gaps() -> None:
+    """Five samples within microseconds, every 10 ms."""
+    time = np.arange(100) // 5 / 100 + np.arange(100) % 5 * 1e-6
+    with pytest.warns(RecordingWarning, match=r"gaps \(19\).* if samples came in packets, give"):
+        Recording(time, np.zeros((100, 1)))
+
+
 def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None:
     time = np.arange(100) / 100
     columns = {"tau": 2.0 * time[:, None], "qd": 3.0 * time[:, None]}

@@ -181,21 +181,25 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
 def offset_warnings(
     problem: ShootingProblem, vector: Tensor, intervals: Sequence[Interval]
 ) -> Iterator[str]:
-    """A sentence for each drive with a larger constant torque than a sensor's usual bias."""
-    plant, force = problem.plant_at(vector), "N" if problem.jacobian.plant.unit == "m" else "N m"
-    terms = {t.name: t for t in problem.variables.terms if "torque_offset" in t.change}
-    for one in intervals:
-        term = terms.get(one.name)
-        # An offset within its prior is an ordinary bias.
-        if term and abs(one.value) > term.prior_sd and one.low * one.high > 0:
-            j = int(term.change["torque_offset"].argmax())
-            whole = float(plant.torque_offset[j])
+    """A sentence for each drive with a larger one-way torque than a sensor's usual bias."""
+    plant, slides = problem.plant_at(vector), problem.jacobian.plant.unit == "m"
+    # Within its prior an offset is a bias like any other; so is what is as small at full speed.
+    usual = problem.options.offset_term[1] / problem.options.asymmetry_term[1]
+    kinds = {"torque_offset", "asymmetry"}
+    terms = {t.name: t for t in problem.variables.terms if kinds & t.change.keys()}
+    for one in (i for i in intervals if i.name in terms and i.low * i.high > 0):
+        ((buffer, chosen),) = terms[one.name].change.items()
+        constant, j = buffer == "torque_offset", int(chosen.argmax())
+        if abs(one.value) > terms[one.name].prior_sd * (1 if constant else usual):
+            # An asymmetry is on the side of the friction.
+            whole = float(dict(plant.named_buffers())[buffer][j]) * (1 if constant else -1)
+            kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")
+            unit = ("N" if slides else "N m") if constant else "N s/m times the speed"
             way = "backwards" if whole > 0 else "forwards"
             yield (
-                f"The fitted plant has a constant drive torque of {whole:.3g} {force} at "
-                f"{plant.joint_names[j]}, which may equally be friction that is "
-                f"{2 * abs(whole):.3g} {force} larger {way}. The friction model and its exports do "
-                f"not include it: add {-whole:.3g} {force} to a command."
+                f"The fitted plant has a {kind} of {whole:.3g} {unit} at {plant.joint_names[j]}, "
+                f"which may equally be friction that is {2 * abs(whole):.3g} {unit} larger {way}. "
+                f"The friction model and its exports lack it: add {-whole:.3g} {unit} to a command."
             )
 
 

@@ -112,7 +112,7 @@ class _FurtherTerms:
 def _newton_decrease(local: Quadratic, chosen: Tensor) -> float:
     """Decrease of the cost that its quadratic model predicts when the chosen variables move."""
     slope = local.gradient[chosen]
-    step = torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution
+    step = torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope, driver="gelsd").solution
     return 0.5 * float(slope @ step)
 
 
