@@ -12,7 +12,7 @@ import math
 import re
 import types
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -97,18 +97,14 @@ def rig(text: str) -> str:
     if text in RIGS:
         return text
     if Path(text).suffix.lower() not in RIG_FILES:
+        by_lower = {name.lower(): name for name in RIGS}
+        near = difflib.get_close_matches(text.lower(), by_lower, 1)
+        meant = f" (did you mean {by_lower[near[0]]}?)" if near else ""
         raise argparse.ArgumentTypeError(
-            f"no rig is called {text!r}{_similar(text, RIGS)}; give a file "
+            f"no rig is called {text!r}{meant}; give a file "
             f"({', '.join(RIG_FILES)}) or one of {', '.join(RIGS)}"
         )
     return str(file(text))
-
-
-def _similar(text: str, names: Iterable[str]) -> str:
-    """A question that suggests a similar name; empty if there is none."""
-    by_lower = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(text.lower(), by_lower, 1)
-    return f" (did you mean {by_lower[near[0]]}?)" if near else ""
 
 
 def file(text: str) -> Path:

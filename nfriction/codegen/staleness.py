@@ -160,7 +160,9 @@ class _Walk:
         if isinstance(value, nn.Module):
             self._module(value)
         elif kind in _SEQUENCES:
-            self._all(value)
+            self._length(len(value))
+            for item in value:
+                self.add(item)
         elif kind in _MAPPINGS:
             self._mapping(value)
         elif kind is types.FunctionType:
@@ -184,11 +186,6 @@ class _Walk:
         self.parts.append(length)
         if len(self.parts) + length > _LIMIT:
             raise Incomparable(f"more than {_LIMIT} values")
-
-    def _all(self, values: Any) -> None:
-        self._length(len(values))
-        for value in values:
-            self.add(value)
 
     def _mapping(self, values: Any) -> None:
         self._length(len(values))

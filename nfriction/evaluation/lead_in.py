@@ -231,11 +231,15 @@ class Simulator:
         squares = np.full((self.draws, self.plant.joints), np.inf)
         at_once = max(1, DRAWN_SAMPLES // samples.size)
         # Where the run itself diverged there is no limit.
+        unit = np.where(self.quantum > 0, self.quantum, 1.0)
         for k in range(0, self.draws if np.isinf(diverged_at).all() else 0, at_once):
             zero = self.zeros[k : k + at_once]
             off = starts.deviations[k : k + at_once] + np.concatenate([zero, 0 * zero], -1)
             drawn, _ = self.simulate(state + off, samples, noise=k)
-            apart = (self._as_read(drawn - zero[:, :, None], measured) - q)[:, :, scored]
+            drawn = drawn - zero[:, :, None]
+            # As the encoder reads positions, its counts in line with the measured ones.
+            read = measured + unit * np.rint((drawn - measured) / unit)
+            apart = (np.where(self.quantum > 0, read, drawn) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
         # Noise of the measured position in excess of its rounding.
         squares += np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
@@ -246,11 +250,6 @@ class Simulator:
             samples, q, (q - measured)[:, scored], squares,
             float((self.time[samples[:, 0]] + diverged_at).min()),
         )  # fmt: skip
-
-    def _as_read(self, q: Array, measured: Array) -> Array:
-        """Positions as the encoder reads them, its counts in line with the measured ones."""
-        unit = np.where(self.quantum > 0, self.quantum, 1.0)
-        return np.where(self.quantum > 0, measured + unit * np.rint((q - measured) / unit), q)
 
     def simulate(
         self, states: Array, samples: NDArray[np.intp], noise: int | None = None, finer: int = 1

@@ -180,11 +180,6 @@ def _slice(
     return g.emit("Slice", a, *(_integers(n) for n in (*ends, dim, step)))
 
 
-def _pad_last(g: OnnxGraph, a: Value, pads: Sequence[int], value: float = 0.0) -> Value:
-    assert len(pads) == 2, "only of the last axis"
-    return g.emit("Pad", a, _integers(*pads), value, _integers(-1))
-
-
 def _view(g: OnnxGraph, a: Any, size: Sequence[int]) -> Value:
     if sum(n == -1 for n in size) > 1:
         raise ExportError("a view with two sizes known only at run time has no ONNX form here.")
@@ -241,7 +236,9 @@ _RULES: dict[str, Rule] = {
     "squeeze": lambda g, a, dim: g.emit("Squeeze", a, _integers(*dim)),
     "unsqueeze": lambda g, a, dim: g.emit("Unsqueeze", a, _integers(dim)),
     "cat": lambda g, parts, dim=0: g.emit("Concat", *parts, axis=dim),
-    "constant_pad_nd": _pad_last,
+    "constant_pad_nd": lambda g, a, pads, value=0.0: g.emit(
+        "Pad", a, _integers(*pads), value, _integers(-1)
+    ),
     "view": _view,
     "permute": lambda g, a, dims: g.emit("Transpose", a, perm=list(dims)),
     "_softmax": lambda g, a, dim, *_: g.emit("Softmax", a, axis=dim),

@@ -102,10 +102,7 @@ class Schedule(nn.Module, ABC):
         return coefficients
 
     def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
-        """Hidden state after every sample of a motion (sample, joint): (sample, joint, state).
-
-        Heat follows the `time` of the samples [s], if given, and cools in gaps.
-        """
+        """Hidden state after each sample, (sample, joint, state); heat cools in gaps of `time`."""
         return self.states_from(self.initial_state(qd[0], qdd[0]), qd, qdd, time)
 
     def states_from(

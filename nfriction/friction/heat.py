@@ -93,10 +93,6 @@ class Heated(Schedule):
         """Set the time between samples [s]."""
         self.set_heat(self.heat_capacity, self.cooling_time, sample_time)
 
-    def take_heat(self, other: "Heated") -> None:
-        """Take capacity, cooling time and sample time of another schedule."""
-        self.set_heat(other.heat_capacity, other.cooling_time, other.sample_time)
-
     def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return torch.zeros_like(qd).unsqueeze(-1)
 

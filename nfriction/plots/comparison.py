@@ -123,7 +123,11 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
     axes[-1, 0].set_xlabel("time [s]")
     figure.align_ylabels(axes[:, 0])
     handles = [Line2D([], [], **style.MEASURED), *(looks[name].handle for name in scores)]
-    style.legend(figure, handles, ["measured", *(_label(n, s) for n, s in scores.items())])
+    labels = [
+        f"{both_names(n)}, diverged at {s.diverged_at:.2g} s" if np.isfinite(s.diverged_at) else n
+        for n, s in scores.items()
+    ]
+    style.legend(figure, handles, ["measured", *labels])
     return figure
 
 
@@ -280,11 +284,6 @@ def _check_same_recording(recording: Recording, scores: Mapping[str, Score]) -> 
                 f"the score of {name!r} has simulated positions {score.simulated.shape}, the "
                 f"recording {recording.q.shape}; scores must be of the same recording."
             )
-
-
-def _label(name: str, score: Score) -> str:
-    at = score.diverged_at
-    return f"{both_names(name)}, diverged at {at:.2g} s" if np.isfinite(at) else name
 
 
 def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> None:

@@ -195,7 +195,10 @@ def warnings_of(
     if beyond := [name for name in at_bounds if name not in at_zero]:
         found.append(f"At a bound: {', '.join(beyond)}; the data favour values beyond it.")
     if unidentifiable:
-        parts = [_in_words(direction) for direction in unidentifiable]
+        parts = [
+            f"{', '.join(others)} and {last} (only their combination)" if others else last
+            for *others, last in (direction.split(" with ") for direction in unidentifiable)
+        ]
         found.append(f"Not identifiable from these data: {'; '.join(parts)}.")
     return tuple(found)
 
@@ -217,12 +220,6 @@ def observed_count(recorded: Tensor) -> float | None:
     """Largest of the encoder counts that positions (window, sample, joint) show; None if none."""
     seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
     return None if math.isnan(seen) else seen
-
-
-def _in_words(direction: str) -> str:
-    """An unidentifiable parameter or combination for a warning."""
-    *others, last = direction.split(" with ")
-    return f"{', '.join(others)} and {last} (only their combination)" if others else last
 
 
 def _symmetric(matrix: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ improve. Every window is held out in turn, and a gain has to exceed its scatter 
 import copy
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -94,14 +95,12 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     contest = _Contest(aligned, widened or start)
     chosen: tuple[InputGain, ...] = ()
     model = task.model
-    try:
+    with suppress(StoppedError):
         if widened is None:
             raise StoppedError
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
         contest.train()
-    except StoppedError:
-        contest.halt()
     if chosen:
         cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     found = replace(
@@ -191,11 +190,6 @@ class _Contest:
         if self.best is None:
             self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
-    def halt(self) -> None:
-        """Keep the network as it is, because the caller stopped its further training."""
-        if self.best is not None:
-            self.best = replace(self.best, end=self.best.end.as_stopped())
-
     def result(self, model: FrictionModel) -> FitResult:
         """The fully trained network, or its law, written into a model of the same kind."""
         task, best, validation = self.task, self.best, self.validation
@@ -263,7 +257,9 @@ def initialise_from_constant(
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
     schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
     if is_heated(model.law):
-        cast("Heated", schedule).take_heat(cast("Heated", constant.model.schedule))
+        law = cast("Heated", constant.model.schedule)
+        heat = law.heat_capacity, law.cooling_time, law.sample_time
+        cast("Heated", schedule).set_heat(*heat)
     return network
 
 

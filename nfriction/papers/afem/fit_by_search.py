@@ -474,9 +474,11 @@ def fit_by_search(
         schedule.set_coefficients(constant.model.schedule.coefficient_sets()["always"])
         windows = cut_windows(task.recordings, task.motions, length)
     step = max(r.longest_step for r in task.recordings)
+    limited = hasattr(os, "sched_getaffinity")
+    usable = len(os.sched_getaffinity(0)) if limited else os.cpu_count() or 1
     error = PositionError(
         constant.plant, varied, windows, task.measurement,
-        integration_substeps(plant, varied, step), threads=options.threads or _processors(),
+        integration_substeps(plant, varied, step), threads=options.threads or usable,
         drive=None if by_class is None else along(windows, by_class.driving),
     )  # fmt: skip
     box = _box(table, varied, constant, task)
@@ -550,10 +552,3 @@ def _box(table: Tabulated, model: FrictionModel, constant: FitResult, task: FitT
     scale = torch.where(log | (scale == 0), 1.0, scale)
     lower, upper = table.bounds()
     return Box(table.parameter_vector(), lower, upper, scale.reshape(-1), log.reshape(-1))
-
-
-def _processors() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -80,7 +80,11 @@ class MamdaniController(nn.Module):
 
     def infer(self, x: Tensor) -> Tensor:
         """Outputs (*batch, outputs) of inputs (*batch, inputs) in the rule base's own units."""
-        strengths = self._term_strengths(self._rule_strengths(x))
+        strengths = self._rule_strengths(x)
+        # Each term's set is clipped once, at its strongest rule, with a fifth of the work of
+        # clipping every rule's. Terms without as many rules point to a row of zeros.
+        padded = torch.cat([strengths, torch.zeros_like(strengths[:1])])
+        strengths = padded[self.rules_of_term].amax(2)
         blocks = strengths.split(_SAMPLES_AT_ONCE, -1)
         y = torch.cat([self._defuzzify(block) for block in blocks], 0)
         return y.reshape(x.shape[:-1] + self.middle.shape)
@@ -95,16 +99,6 @@ class MamdaniController(nn.Module):
             asked = torch.stack([*held, torch.ones_like(held[0])])[self.antecedents[i]]
             strengths = asked if i == 0 else torch.minimum(strengths, asked)
         return strengths * self.weights
-
-    def _term_strengths(self, strengths: Tensor) -> Tensor:
-        """Strongest rule of each output term, (outputs, terms, samples).
-
-        Clipping every rule's set and taking the largest is the same as clipping each term's set
-        once at its strongest rule, with a fifth of the work.
-        """
-        # Terms without as many rules point to a row of zeros.
-        padded = torch.cat([strengths, torch.zeros_like(strengths[:1])])
-        return padded[self.rules_of_term].amax(2)
 
     def _defuzzify(self, strengths: Tensor) -> Tensor:
         """Centroids (samples, outputs) of the clipped sets."""
