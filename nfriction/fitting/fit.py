@@ -19,6 +19,7 @@ from pathlib import Path
 from nfriction.fitting.options import Eccentricity, EncoderReference, FitOptions, Loss, Method
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.task import Callback, FitTask, prepare_task
+from nfriction.friction.inputs import is_heated
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import RecordingLike
@@ -106,9 +107,9 @@ def fit(
     if not schedule.fit_strategy:
         raise ValueError(f"cannot fit coefficients of type {type(schedule).__name__}.")
     if method == "equation_error" and schedule.follows_motion:
-        raise ValueError(
-            'adaptive and neuro-fuzzy models need simulated windows: `method="output_error"`.'
-        )
+        raise ValueError('adaptive and neuro-fuzzy models need `method="output_error"`.')
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
-    return strategy(task).with_warnings(task.data_warnings, task.mistakes, task.unmodelled)
+    found = strategy(task)
+    unmodelled = task.play if is_heated(found.model.law) else (*task.drift, *task.play)
+    return found.with_warnings(task.data_warnings, task.mistakes, unmodelled)

@@ -62,10 +62,6 @@ class RobustLoss:
         sd = errors.abs().median(0).values / MEDIAN
         return cls(name, EFFICIENT[name] * sd.clamp_min(least))
 
-    def is_near(self, other: "RobustLoss", tolerance: float) -> bool:
-        """True if the scales differ by no more than this fraction."""
-        return bool((self.scale / other.scale - 1).abs().max() <= tolerance)
-
     def weight(self, errors: Tensor) -> Tensor:
         """rho'(z): weight of each error (..., joint), 1 where it is small."""
         if self.name == "linear":

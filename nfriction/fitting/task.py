@@ -58,7 +58,7 @@ class FitTask:
         delay: of the torque after the positions from the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
         mistakes: likely mistakes in recordings or plant.
-        unmodelled: those of `data_warnings` on changes of friction and play, which no model has.
+        drift, play: those of `data_warnings` on changes of friction and on play of gears.
     """
 
     model: FrictionModel
@@ -73,7 +73,8 @@ class FitTask:
     delay: float = 0.0
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
-    unmodelled: tuple[str, ...] = ()
+    drift: tuple[str, ...] = ()
+    play: tuple[str, ...] = ()
 
 
 def prepare_task(
@@ -127,17 +128,19 @@ def prepare_task(
         # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
     of = plant, advanced, moved, options
-    unmodelled = () if mistakes else (*changing_friction(*of), *loose_loads(*of))
+    drift = () if mistakes else tuple(changing_friction(*of))
+    play = () if mistakes else tuple(loose_loads(*of))
     found = (
         *named,
-        *unmodelled,
+        *drift,
+        *play,
         *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
     )
     measurement = measurement_matrix(plant, convention)
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
-        found, tuple(m.text for m in mistakes), unmodelled,
+        found, tuple(m.text for m in mistakes), drift, play,
     )  # fmt: skip
 
 

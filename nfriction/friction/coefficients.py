@@ -105,9 +105,7 @@ class Schedule(nn.Module, ABC):
         """Hidden state after each sample, (sample, joint, state); heat cools in gaps of `time`."""
         return self.states_from(self.initial_state(qd[0], qdd[0]), qd, qdd, time)
 
-    def states_from(
-        self, first: Tensor, qd: Tensor, qdd: Tensor, time: Tensor | None = None
-    ) -> Tensor:
+    def states_from(self, first: Tensor, qd: Tensor, qdd: Tensor, time: Any = None) -> Tensor:
         """The same with the state after the first sample given, (*batch, joint, state)."""
         # One by one, as each state needs the one before; a subclass may know a faster way.
         rows = [first]

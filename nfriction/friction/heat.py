@@ -114,9 +114,7 @@ class Heated(Schedule):
         return torch.cat([cold[..., :-1] + 0.0 * state, state], -1)
 
     @torch.no_grad()
-    def states_from(
-        self, first: Tensor, qd: Tensor, qdd: Tensor, time: Tensor | None = None
-    ) -> Tensor:
+    def states_from(self, first: Tensor, qd: Tensor, qdd: Tensor, time: Any = None) -> Tensor:
         # As `advance` from sample to sample, with the power of cold friction from one call.
         cold = self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
         steps = np.full(len(qd) - 1, self.sample_time)

@@ -355,7 +355,10 @@ def save_all(
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, figure in _figures(comparison, recordings):
-        path = _free(folder, name, written)
+        stem = re.sub(r"[^\w-]+", "_", name)
+        # Names of recordings may differ only in characters that are replaced here.
+        ends = ("", *(f"_{k}" for k in range(2, 3 + len(written))))
+        path = next(p for end in ends if (p := folder / f"{stem}{end}.png") not in written)
         kept = {RUN_KEY: run} if run else {}
         figure.savefig(path, dpi=DPI, metadata=kept)
         for ending in set(formats) - {"gif"}:
@@ -368,13 +371,6 @@ def save_all(
         for k, recording in enumerate(r for r in recordings if r.name in tested):
             written.append(comparison.animate(recording, folder / f"motion_{k + 1}.gif"))
     return written
-
-
-def _free(folder: Path, name: str, taken: Sequence[Path]) -> Path:
-    """An unused path: names of recordings may differ only in characters that are replaced here."""
-    stem = re.sub(r"[^\w-]+", "_", name)
-    ends = ("", *(f"_{k}" for k in range(2, 3 + len(taken))))
-    return next(path for end in ends if (path := folder / f"{stem}{end}.png") not in taken)
 
 
 def _figures(

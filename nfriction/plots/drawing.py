@@ -56,7 +56,11 @@ def mechanism(plant: Plant) -> Figure:
             ax.set_adjustable("datalim")
         if isinstance(plant, PendulumChain) and view is views[-1]:
             steps = np.diff(points, axis=0)
-            for share, start, step in zip(_centres(plant), points, steps, strict=False):
+            # Mass centres as shares of the links' lengths; none for a balanced rotor.
+            shares = [0.5] * bool(plant.to_dict()["mass"])
+            if not isinstance(plant, Rotor):
+                shares = np.divide(plant.to_dict()["com"], plant.length.detach().numpy())
+            for share, start, step in zip(shares, points, steps, strict=False):
                 ax.plot(*(start + share * step), "X", color=style.COLOURS[1], zorder=3)
     words = axes[0, -1]
     words.set_axis_off()
@@ -145,13 +149,6 @@ def _views(plant: Plant) -> list[_View]:
             [[0.0, 0.0], [np.cos(q[0]), np.sin(q[0])]]
         )))  # fmt: skip
     return views
-
-
-def _centres(plant: PendulumChain) -> Array:
-    """Mass centres as shares of the links' lengths; none for a balanced rotor."""
-    if isinstance(plant, Rotor):
-        return np.array([0.5] * bool(plant.to_dict()["mass"]))
-    return np.divide(plant.to_dict()["com"], plant.length.detach().numpy())
 
 
 def _frame(ax: Axes, view: _View, plant: Plant) -> None:

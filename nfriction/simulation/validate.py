@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import wraps
 from numbers import Integral
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -252,18 +252,14 @@ def _fastest_decay(system: System) -> float:
     return _decay_rates[key]
 
 
-Model = TypeVar("Model", bound=Friction)
-
-
-def at_sample_time(friction: Model, sample_time: float) -> Model:
+def at_sample_time(friction: Any, sample_time: float) -> Any:
     """The model, or a copy with its parameters whose hidden state advances by this time [s]."""
     meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
     # Clocks jitter, and time constants are known less exactly than to a thousandth.
     if meant is None or math.isclose(meant, sample_time, rel_tol=1e-3):
         return friction
-    moved: Any = copy.copy(friction)
-    schedule = copy.copy(moved.schedule)
+    moved, schedule = copy.copy(friction), copy.copy(friction.schedule)
     schedule._buffers = {name: x.clone() for name, x in schedule._buffers.items()}
     schedule.set_sample_time(sample_time)
     moved._modules = {**moved._modules, "schedule": schedule}
-    return cast(Model, moved)
+    return moved

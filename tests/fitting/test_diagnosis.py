@@ -445,7 +445,7 @@ def test_friction_that_changes_between_recordings_is_of_no_other_rig(factor, cha
     for given in (recordings, recordings[1:]):
         task = prepare_task(CVFM(1), plant, given, FitOptions())
         assert not task.mistakes
-        (found,) = task.unmodelled
+        (found,) = task.drift
         assert re.match(rf"The friction of joint1 {change} by \d+ % .* to the last", found)
 
 

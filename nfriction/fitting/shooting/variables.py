@@ -26,9 +26,9 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 
 
 def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
-    """A friction model for simulations that count substeps as samples."""
+    """A copy of a friction model for simulations that count substeps as samples."""
     sample_time = getattr(model.schedule, "sample_time", None) or math.nan
-    return at_sample_time(model, sample_time / substeps)
+    return at_sample_time(copy.deepcopy(model), sample_time / substeps)
 
 
 def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:

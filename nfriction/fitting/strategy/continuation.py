@@ -161,7 +161,8 @@ class ShootingFitter:
             if scaled or found.stopped:
                 break
             problem = problem.rescaled(x)
-            if problem.loss.is_near(found.problem.loss, options.scale_tolerance):
+            change = problem.loss.scale / found.problem.loss.scale - 1
+            if change.abs().max() <= options.scale_tolerance:
                 break
         return found
 

@@ -82,16 +82,20 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     require_motion(task.plant, task.recordings)
     given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
     task = replace(task, plant=seeing_plant(task.plant, given))
-    heated = is_heated(task.model.law)
-    start = constant_start(_without_inputs(task) if heated else task)
+    heated, own = is_heated(task.model.law), task
+    if heated:
+        law = cast("NeuroFuzzyModel", task.model).definition
+        cold = FrictionModel(law, Constant(law, task.model.joints), task.model.v_smooth)
+        own = replace(task, model=cold)
+    start = constant_start(own)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
     aligned = replace(task, recordings=recordings, motions=motions)
     widened = widened_start(aligned, start, given) if heated else start
     if widened is None:
-        cold = widened_fitter(aligned, start, given, longest_duration(motions)).friction
-        start = replace(start, model=cold)
+        fitter = widened_fitter(aligned, start, given, longest_duration(motions))
+        start = replace(start, model=fitter.friction)
     contest = _Contest(aligned, widened or start)
     chosen: tuple[InputGain, ...] = ()
     model = task.model
@@ -112,13 +116,6 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
-
-
-def _without_inputs(task: FitTask) -> FitTask:
-    """The task of the law itself, with constant coefficients."""
-    model = cast("NeuroFuzzyModel", task.model)
-    schedule = Constant(model.definition, model.joints)
-    return replace(task, model=FrictionModel(model.definition, schedule, model.v_smooth))
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
