@@ -76,7 +76,7 @@ def rollout(
         scheme: `"rk4"` integrates friction as a smooth function of velocity, so that joints creep
             where they ought to rest. `"time_stepping"` takes semi-implicit steps of first order
             in which dry friction stops a joint and holds it, however steep; it needs shorter
-            steps, and has no gradients, measured drive or hidden state.
+            steps, and has no gradients or measured drive.
         drive: motion that drives the coefficients: `"simulated"`, or `"measured"` as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
         hidden_state: of the coefficients after the first sample (see `Schedule.states`), (*batch,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nfriction.simulation.compiled import System, integrate_compiled
 from nfriction.simulation.memory_step import memory_of, unit_responses
-from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs, as_stateful
+from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import simulate_eager
 
 # Velocity, in units of the smoothing velocity, above which a joint slides with the law's friction.
@@ -72,17 +72,15 @@ def simulate_stiction(
     plant: Plant, friction: Friction, inputs: RolloutInputs, gradients: bool | None
 ) -> tuple[Tensor, ...]:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint)."""
-    given = gradients or inputs.measured is not None or inputs.hidden_state is not None
     if memory_of(friction) is not None:
         raise ValueError(
             "a friction law with memory holds a joint by itself, so it needs no `time_stepping`; "
             'use scheme="rk4".'
         )
-    if given or isinstance(friction, NoFriction) or as_stateful(friction) is not None:
+    if gradients or inputs.measured is not None or isinstance(friction, NoFriction):
         raise ValueError(
-            '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
-            "drive or coefficients with a hidden state (adaptive ones, and those of the input "
-            '"heat"); use scheme="rk4" for these.'
+            '`scheme="time_stepping"` needs a friction model, and has no gradients or measured '
+            'drive; use scheme="rk4" for these.'
         )
     as_double = {name: getattr(inputs, name).double() for name in ("q0", "qd0", "tau", "step")}
     double = replace(inputs, **as_double)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import ALFM, CVFM, LFM, LinearAxis, PendulumChain, codegen, rollout, score
-from nfriction.simulation import compiled
+from nfriction import CVFM, LFM, LinearAxis, PendulumChain, codegen, rollout, score
+from nfriction.simulation import compiled, stiction
 from tests.fitting.recordings import F64, pendulum, swing
+from tests.friction.test_heat import warming
 
 DRY = 2.0
 
@@ -131,8 +132,21 @@ def test_what_it_cannot_do_is_refused():
     plant, zero = pendulum(), torch.zeros(2, dtype=F64)
     with pytest.raises(ValueError, match="needs a friction model"):
         rollout(plant, None, zero, zero, steps=2, scheme="time_stepping")
-    with pytest.raises(ValueError, match="with a hidden state"):
-        rollout(plant, ALFM(2), zero, zero, steps=2, scheme="time_stepping", gradients=False)
+
+
+@pytest.mark.parametrize("compiles", [True, False])
+def test_it_warms_joints_as_the_smooth_scheme_does(compiles, monkeypatch):
+    plant, start = pendulum(normal_load="bearing"), torch.tensor([2.0, 0.5], dtype=F64)
+    given = {"sample_time": 2e-3, "steps": 1000 if compiles else 50, "gradients": False}
+    smooth = rollout(plant, warming(), start, 0 * start, substeps=4, **given)
+    if not compiles:
+        monkeypatch.setattr(stiction, "integrate_compiled", lambda *args, **kwargs: None)
+    given |= {"scheme": "time_stepping", "substeps": 40}
+    found = rollout(plant, warming(), start, 0 * start, **given)
+    torch.testing.assert_close(found.q, smooth.q, rtol=0, atol=1e-3)
+    warm = torch.ones(2, 1, dtype=F64)
+    later = rollout(plant, warming(), start, 0 * start, hidden_state=warm, **given)
+    assert (later.q - found.q).abs().max() > (1e-2 if compiles else 1e-5)
 
 
 def test_a_score_may_take_it():
