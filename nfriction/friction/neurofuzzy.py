@@ -491,7 +491,11 @@ class NeuroFuzzyModel(NamedModel):
         inputs: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
-        law = with_inputs(self.definition, inputs or ())
+        law, own = with_inputs(self.definition, inputs or ()), len(self.definition.names)
+        if initial is not None:
+            initial = torch.as_tensor(initial, dtype=torch.float64)
+            if initial.shape[-1:] == (own,):  # of the law alone: further inputs start at zero
+                initial = pad(initial, [0, len(law.names) - own])
         schedule = self.make_schedule(law, joints, initial, **options)
         FrictionModel.__init__(self, law, schedule, v_smooth)
         self.inputs = None if inputs is None else list(inputs)

@@ -161,6 +161,15 @@ def test_heat_is_refused_where_a_constant_is_not_positive(given) -> None:
         warming().schedule.set_heat(*given)
 
 
+def test_initial_values_may_be_those_of_the_law_alone() -> None:
+    model = NFCVFM(2, [0.1, 0.2], inputs=["load", "heat"])
+    expected = torch.tensor([0.1, 0.2, 0.0, 0.0, 0.0], dtype=F64).expand(2, -1)
+    found = model.schedule.reference_coefficients()
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match=r"got shape \(1,\)"):
+        NFCVFM(2, [0.1], inputs=["heat"])
+
+
 def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
     with pytest.raises(ValueError, match=r"each of 2 joints, got shape \(3,\)"):
         warming().schedule.set_heat([1.0, 2.0, 3.0], 1.0, 1.0)
