@@ -174,14 +174,14 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         `unit_shift` (joint, unit, input and coefficient); `weights` (joint, unit, coefficient);
         `reference`, `roundness` (joint, coefficient); `positive` (coefficient,).
     """
-    anfis, head, kept = schedule.network.anfis, schedule.network.head, schedule.kept
+    anfis, head, unvaried = schedule.network.anfis, schedule.network.head, schedule.unvaried
     joints, terms = schedule.joints, schedule.terms
     sets = max(terms)
     lower = torch.stack([torch.zeros_like(schedule.velocity_range), schedule.acceleration_lower], 1)
     upper = torch.stack([schedule.velocity_range, schedule.acceleration_upper], 1)
     half_range = 0.5 * (upper - lower)
     half = 0.5 * schedule.scale
-    bias = pad(head.output_bias, (0, kept))
+    bias = pad(head.output_bias, (0, unvaried))
 
     # The network's own inputs are (x + 1) / 2.
     centres, widths = anfis.sets()
@@ -194,7 +194,7 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         for x, fill in ((slope, 0.0), (shift, _NOWHERE))
     )
 
-    consequents = pad(anfis.consequents, (0, 0, 0, 0, 0, kept))
+    consequents = pad(anfis.consequents, (0, 0, 0, 0, 0, unvaried))
     slopes = 0.5 * consequents[..., :2]
     constants = consequents[..., 2] + slopes.sum(-1) + bias.unsqueeze(2)
     columns = torch.cat([slopes, constants.unsqueeze(3)], 3) * half[:, :, None, None]
@@ -202,7 +202,7 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
     planes = columns.unflatten(2, terms).permute(0, 4, 1, 2, 3)
     planes = pad(planes, (0, sets - terms[1], 0, sets - terms[0])).reshape(joints, -1, sets)
 
-    unit_widths = math.sqrt(2.0) * torch.exp(pad(head.log_widths, (0, kept)))
+    unit_widths = math.sqrt(2.0) * torch.exp(pad(head.log_widths, (0, unvaried)))
     middle = torch.full_like(lower, 0.5)
     seen = torch.cat([middle, -bias], 1).unsqueeze(1)
     scale = torch.cat([middle, 1.0 / half], 1).unsqueeze(1)
@@ -215,8 +215,8 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         "set_shift": set_shift,
         "planes": planes,
         "unit_slope": scale / unit_widths,
-        "unit_shift": (seen - pad(head.centres, (0, kept))) / unit_widths,
-        "weights": (pad(head.output_weight, (0, 0, 0, kept)) * half.unsqueeze(2)).mT,
+        "unit_shift": (seen - pad(head.centres, (0, unvaried))) / unit_widths,
+        "weights": (pad(head.output_weight, (0, 0, 0, unvaried)) * half.unsqueeze(2)).mT,
         "roundness": (schedule.scale * schedule.roundness).square(),
         "positive": schedule.positive,
     }

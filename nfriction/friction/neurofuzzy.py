@@ -135,7 +135,7 @@ class NeuroFuzzy(Schedule):
         k = len(law.names)
         # The last coefficients of some laws no fit varies, such as those of heat.
         self.outputs = max(i + 1 for i, varied in enumerate(self.fitted_mask) if varied)
-        self.kept = k - self.outputs
+        self.unvaried = k - self.outputs
         self.terms, self.head_units = tuple(terms), head_units
         self.interpretable = bool(interpretable)
         self.along_motion = acceleration == "along_motion"
@@ -168,7 +168,7 @@ class NeuroFuzzy(Schedule):
     def deviation(self, x: Tensor) -> Tensor:
         """Deviation from the reference at inputs within the range, (*batch, joint, coefficient)."""
         found = self.network(x)
-        return pad(found, [0, self.kept]) if self.kept else found
+        return pad(found, [0, self.unvaried]) if self.unvaried else found
 
     def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
@@ -397,7 +397,7 @@ class NeuroFuzzy(Schedule):
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
         by_x = by_x + self.network(x)[..., None] * slope[..., None, :]
-        return pad(by_x, [0, 0, 0, self.kept])
+        return pad(by_x, [0, 0, 0, self.unvaried])
 
     @torch.no_grad()
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
@@ -407,7 +407,7 @@ class NeuroFuzzy(Schedule):
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             # The map to coefficients is elementwise, so the sum's gradient is its slope.
-            u = weight * pad(y + head(both), [0, self.kept])
+            u = weight * pad(y + head(both), [0, self.unvaried])
             u = (self.reference + u).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
@@ -415,7 +415,7 @@ class NeuroFuzzy(Schedule):
         own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
         # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
-        by_y = pad(by_y, [0, 0, 0, self.kept])
+        by_y = pad(by_y, [0, 0, 0, self.unvaried])
         by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
         if not self.learn_sets:
