@@ -137,15 +137,12 @@ def _interpret(
             return leaf.nodes
         return constants(graph, leaf) if isinstance(leaf, Tensor) else leaf
 
-    def example_of(leaf: Any) -> Any:
-        return leaf.example if isinstance(leaf, ScalarTensor) else leaf
-
     def given(function: Callable[[Any], Any]) -> tuple[list[Any], dict[str, Any]]:
         return _each(function, args), {name: _each(function, x) for name, x in kwargs.items()}
 
     own, named = given(nodes_of)
     nodes = operation(graph, *own, **named)
-    own, named = given(example_of)
+    own, named = given(lambda x: x.example if isinstance(x, ScalarTensor) else x)
     example = func(*own, **named)
     if torch.Tag.inplace_view in func.tags:
         return _reshape_in_place(args[0], nodes, func, args, kwargs)

@@ -63,7 +63,7 @@ def controller_of(
                 "`ModelInfo.sample_time` [s], but it is None."
             )
         model = sampled(model, info.sample_time)
-    elif info.sample_time is not None and getattr(model.schedule, "sample_time", None):
+    elif info.sample_time is not None and hasattr(model.schedule, "set_sample_time"):
         model = copy.deepcopy(model)
         cast(Any, model.schedule).set_sample_time(info.sample_time)
     if not with_filter:

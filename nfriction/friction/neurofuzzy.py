@@ -16,7 +16,7 @@ from nfriction.friction.heat import Heated
 from nfriction.friction.inputs import is_heated, with_inputs
 from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
-from nfriction.friction.parameters import Sensitivity, positive_number, require_options
+from nfriction.friction.parameters import Sensitivity, as_tensor, positive_number, require_options
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.fuzzy.partition import FreePartition
@@ -134,7 +134,7 @@ class NeuroFuzzy(Schedule):
             )
         k = len(law.names)
         # The last coefficients of some laws no fit varies, such as those of heat.
-        self.outputs = max(i + 1 for i, varied in enumerate(self.fitted_mask) if varied)
+        self.outputs = max((i + 1 for i in range(k) if self.fitted_mask[i]), default=1)
         self.unvaried = k - self.outputs
         self.terms, self.head_units = tuple(terms), head_units
         self.interpretable = bool(interpretable)
@@ -493,7 +493,7 @@ class NeuroFuzzyModel(NamedModel):
     ) -> None:
         law, own = with_inputs(self.definition, inputs or ()), len(self.definition.names)
         if initial is not None:
-            initial = torch.as_tensor(initial, dtype=torch.float64)
+            initial = as_tensor("coefficients", initial)
             if initial.shape[-1:] == (own,):  # of the law alone: further inputs start at zero
                 initial = pad(initial, [0, len(law.names) - own])
         schedule = self.make_schedule(law, joints, initial, **options)

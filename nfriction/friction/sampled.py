@@ -92,6 +92,10 @@ class _Sampled(Schedule):
         self.register_buffer("step", step, persistent=False)
         self.register_buffer("rest", step.new_zeros(self.state_size), persistent=False)
 
+    def set_sample_time(self, sample_time: float) -> None:
+        self.sample_time = sample_time
+        self.step.fill_(sample_time)
+
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         first = self.advance(qd, qdd, self.initial_state(qd, qdd))
         return self.coefficients_from(qd, qdd, first)

@@ -148,7 +148,8 @@ class LevenbergMarquardt:
         root = positive_diagonal(state.scale).sqrt()
         while True:
             step = state.damped_step(root)
-            predicted = state.predicted_decrease(step)
+            local = state.local
+            predicted = -float(local.gradient @ step + 0.5 * step @ (local.hessian @ step))
             length, negligible = float((root * step).norm()), self.cost_tolerance * state.cost
             weak = state.damping <= WEAK_DAMPING
             short = weak and length <= self.step_tolerance * float((root * state.x).norm())
@@ -216,9 +217,6 @@ class _State:
         slope = self.local.gradient / root
         solve = partial(solve_free, blocks=self.local.blocks)
         return bounded_qp.minimise(system, slope, low, high, ~self.frozen(), solve) / root
-
-    def predicted_decrease(self, step: Tensor) -> float:
-        return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
 
     def attempt(self, step: Tensor, length: float, model: Model, cost: Cost | None) -> float:
         """Move if the cost decreases and all is finite; return the decrease, or -inf."""

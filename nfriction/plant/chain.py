@@ -256,9 +256,8 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, tau=tau)
         if self.has_eccentricity:
-            corrected = self._corrected(q)
-            qdd = self._accelerate(corrected.angle, corrected.slope * qd, tau)
-            return corrected.read_acceleration(qd, qdd)
+            angle, slope, curvature = self._corrected(q)
+            return (self._accelerate(angle, slope * qd, tau) - curvature * qd * qd) / slope
         return self._accelerate(q, qd, tau)
 
     def _accelerate(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
@@ -281,9 +280,8 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, qdd=qdd)
         if self.has_eccentricity:
-            corrected = self._corrected(q)
-            true_qdd = corrected.true_acceleration(qd, qdd)
-            q, qd, qdd = corrected.angle, corrected.slope * qd, true_qdd
+            q, slope, curvature = self._corrected(q)
+            qd, qdd = slope * qd, slope * qdd + curvature * qd * qd
         geometry = self._geometry(q)
         inertial = dynamics.multiply(
             self._mass(geometry), dynamics.absolute(qdd.unbind(-1), self.first_link)

@@ -372,14 +372,6 @@ class EncoderCorrection(NamedTuple):
     slope: Tensor
     curvature: Tensor
 
-    def true_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """True acceleration from a reading's rate and acceleration."""
-        return self.slope * qdd + self.curvature * qd * qd
-
-    def read_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The reading's acceleration from its rate and the true acceleration."""
-        return (qdd - self.curvature * qd * qd) / self.slope
-
 
 def correct_encoder(q: Tensor, zero: Tensor, cosine: Tensor, sine: Tensor) -> EncoderCorrection:
     """True angles from readings of eccentric encoders.

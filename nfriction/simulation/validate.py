@@ -252,14 +252,28 @@ def _fastest_decay(system: System) -> float:
     return _decay_rates[key]
 
 
-def at_sample_time(friction: Any, sample_time: float) -> Any:
-    """The model, or a copy with its parameters whose hidden state advances by this time [s]."""
-    meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
+def at_sample_time(schedule: Any, sample_time: float) -> Any:
+    """The schedule, or a copy with its parameters whose hidden state advances by this time [s]."""
+    meant = getattr(schedule, "sample_time", None)
     # Clocks jitter, and time constants are known less exactly than to a thousandth.
     if meant is None or math.isclose(meant, sample_time, rel_tol=1e-3):
+        return schedule
+    moved = copy.deepcopy(schedule, {id(p): p for p in schedule.parameters()})
+    moved.set_sample_time(sample_time)
+    return moved
+
+
+def stepping_by(friction: Any, step: Tensor) -> Any:
+    """The model, or a copy with its parameters whose hidden state advances by these steps [s]."""
+    schedule = getattr(friction, "schedule", None)
+    if getattr(schedule, "sample_time", None) is None or not step.numel():
         return friction
-    moved, schedule = copy.copy(friction), copy.copy(friction.schedule)
-    schedule._buffers = {name: x.clone() for name, x in schedule._buffers.items()}
-    schedule.set_sample_time(sample_time)
-    moved._modules = {**moved._modules, "schedule": schedule}
+    rows = step.contiguous().median(-1).values  # NaN of an expanded tensor, in torch 2.13
+    if rows.max() > 1.1 * rows.min():  # less is jitter
+        raise ValueError(
+            "a hidden state needs one `sample_time` for a batch, got "
+            f"{float(rows.min()):g} to {float(rows.max()):g} s; simulate each rate by itself."
+        )
+    moved = copy.copy(friction)
+    moved._modules = {**moved._modules, "schedule": at_sample_time(schedule, float(rows.max()))}
     return moved

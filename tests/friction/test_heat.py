@@ -99,7 +99,7 @@ def test_heat_follows_the_time_of_samples() -> None:
     assert (found[200] < 1.3 * math.exp(-4.0 / 3.0) * regular[199]).all()
     # At half the rate the same samples last twice as long.
     slow = model.schedule.states(qd, qdd, 2 * time)
-    torch.testing.assert_close(slow, at_sample_time(model, 2 * STEP).schedule.states(qd, qdd))
+    torch.testing.assert_close(slow, at_sample_time(model.schedule, 2 * STEP).states(qd, qdd))
     assert (slow[-1] > 1.2 * regular[-1]).all()
 
 

@@ -323,11 +323,31 @@ def test_a_measured_motion_drives_the_memory_too(backend):
 def test_a_memory_made_for_other_samples_fades_within_the_same_time():
     model = named_model("ALFM")
     made = model.schedule.sample_time
-    other = at_sample_time(model, 2e-3)
-    assert float(other.schedule.fading) == pytest.approx(math.exp(-2e-3 / 2.0))
+    other = at_sample_time(model.schedule, 2e-3)
+    assert float(other.fading) == pytest.approx(math.exp(-2e-3 / other.time_constant))
     assert model.schedule.sample_time == made
-    assert other.schedule.raw is model.schedule.raw
-    assert at_sample_time(model, 1.0001 * made) is model
+    assert other.raw is model.schedule.raw
+    assert at_sample_time(model.schedule, 1.0001 * made) is model.schedule
+
+
+def test_a_batch_of_different_rates_needs_coefficients_without_memory():
+    steps = torch.tensor([[1e-3] * 5, [4e-3] * 5])
+    with pytest.raises(ValueError, match=r"for a batch, got 0\.001 to 0\.004 s"):
+        run(named_model("ALFM"), sample_time=steps)
+    assert run(named_model("LFM"), sample_time=steps).q.shape == (2, 6, 2)
+
+
+@pytest.mark.parametrize("name", ["ALFM", "NFLFM"])
+def test_states_follow_the_time_of_samples(name):
+    model = named_model("ALFM")
+    if name == "NFLFM":
+        model = NFLFM(2, network="rbf", derivatives=2)
+    time = 5e-3 * torch.arange(200, dtype=F64)
+    qd = torch.sin(9 * time)[:, None].expand(-1, 2).clone()
+    qdd = 9 * torch.cos(9 * time)[:, None].expand(-1, 2).clone()
+    expected = at_sample_time(model.schedule, 5e-3).states(qd, qdd)
+    assert torch.equal(model.schedule.states(qd, qdd, time), expected)
+    assert not torch.allclose(model.schedule.states(qd, qdd), expected)
 
 
 def test_a_memory_must_fit_the_model():

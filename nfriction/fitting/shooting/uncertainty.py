@@ -106,13 +106,6 @@ def _counted(problem: ShootingProblem) -> float:
     return float(problem.scale.square().sum()) * problem.windows.q.shape[-1]
 
 
-def _beside_torque(problem: ShootingProblem, x: Tensor, response: Tensor) -> float:
-    """Share of the residuals that the noise of torques does not cause [-]."""
-    power = float((problem.counted_errors(x) * problem.scale).square().sum()) / _counted(problem)
-    rest = power - _once_fitted(problem, x, response) ** 2
-    return min(1.0, math.sqrt(max(rest, rounding(problem) ** 2) / power))
-
-
 def gathered_information(
     problem: ShootingProblem, x: Tensor, sd: Tensor, count: float | None = None
 ) -> Information:
@@ -136,8 +129,13 @@ def gathered_information(
         score = kept.by_states(response, of_states)
         score += drawn_score(problem.rows(run, scale), kept, response, drawn)
     else:
-        # The residuals already contain the errors that are drawn.
-        share = 1.0 if by_torque is None else _beside_torque(problem, x, by_torque[..., 0])
+        share = 1.0
+        if by_torque is not None:
+            # The residuals already contain the errors that the noise of torques causes.
+            squares = (problem.counted_errors(x) * problem.scale).square()
+            power = float(squares.sum()) / _counted(problem)
+            rest = power - _once_fitted(problem, x, by_torque[..., 0]) ** 2
+            share = min(1.0, math.sqrt(max(rest, rounding(problem) ** 2) / power))
         rows = problem.rows(run, problem.scale * share * sd / problem.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
     if by_torque is not None:

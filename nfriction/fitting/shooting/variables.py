@@ -27,8 +27,10 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 
 def substepped(model: FrictionModel, substeps: int) -> FrictionModel:
     """A copy of a friction model for simulations that count substeps as samples."""
+    copied = copy.deepcopy(model)
     sample_time = getattr(model.schedule, "sample_time", None) or math.nan
-    return at_sample_time(copy.deepcopy(model), sample_time / substeps)
+    copied.schedule = at_sample_time(copied.schedule, sample_time / substeps)
+    return copied
 
 
 def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:

@@ -11,6 +11,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
+from nfriction.simulation.validate import at_sample_time
 
 CLASSES = ("low", "medium", "high")
 
@@ -189,6 +190,8 @@ class Adaptive(Tabulated):
         return {"always": sets[0]} if constant else dict(zip(CLASSES, sets, strict=True))
 
     def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
+        if time is not None and len(time) > 1:
+            return at_sample_time(self, float(time.diff().median())).states(qd, qdd)
         # As in the base class, but without a step of torch to every sample.
         first = torch.sqrt(qdd[:1] ** 2 + (self.swing_rate * qd[:1]) ** 2)
         size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)

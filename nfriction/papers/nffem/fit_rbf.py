@@ -8,7 +8,6 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import (
     apply_encoder_offsets,
-    integration_substeps,
     require_motion,
 )
 from nfriction.fitting.equation_error import coefficient_scale
@@ -50,16 +49,10 @@ def fit_rbf(task: FitTask) -> FitResult:
     values = start.model.schedule.coefficient_sets()["always"]
     scale = torch.maximum(values.abs(), coefficient_scale(model, start.plant, recordings, motions))
     scale = torch.where(scale > 0, scale, torch.ones_like(scale))
-    sample_time = recordings[0].sample_time
-    schedule.set_sample_time(sample_time)
+    schedule.set_sample_time(recordings[0].sample_time)
     place_units(schedule, values, scale, motions)
     base = schedule.parameter_vector()
     sd = (PRIOR_SD * scale)[..., None].expand(-1, -1, schedule.head_units + 1).reshape(-1)
-    # The memory advances with every step of the integration while the search lasts.
-    longest = max(r.longest_step for r in recordings)
-    schedule.set_sample_time(
-        sample_time / integration_substeps(start.plant, model, longest, options)
-    )
     fitter = ShootingFitter(
         StepJacobian(start.plant, model, []), model, recordings, task.measurement, options,
         task.callback, friction_prior=(base, sd), plant_prior=(base[:0], base[:0]),
@@ -77,7 +70,6 @@ def fit_rbf(task: FitTask) -> FitResult:
             note = validation.lost_by(end)
     except StoppedError:
         note = INTERRUPTED
-    schedule.set_sample_time(sample_time)
     if end is None or note:
         return constant_kept(start, model, note, converged=note != INTERRUPTED)
     found = result_from_shooting(model, end.problem, end.result, task.motions)

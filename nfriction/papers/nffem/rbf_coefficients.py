@@ -13,6 +13,7 @@ from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import RBFNetwork
+from nfriction.simulation.validate import at_sample_time
 
 
 class RBFCoefficients(Schedule):
@@ -147,6 +148,8 @@ class RBFCoefficients(Schedule):
         return torch.stack([smoothed, jerk, snap + self.gain * (change - snap)], -1)
 
     def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
+        if time is not None and len(time) > 1:
+            return at_sample_time(self, float(time.diff().median())).states(qd, qdd)
         if not self.remembers:
             return self.initial_state(qd, qdd)
         # As in the base class, but without a step of torch to every sample.
