@@ -39,11 +39,11 @@ class Item:
     """A table or figure of a paper.
 
     Attributes:
-        title: its number and the content of its caption.
+        title: its number and caption.
         differs: difference between ours and the paper's, if there is one.
-        tables: caption and content, by the name of the file.
-        figures: by the name of the file.
-        models: models whose fits' status the page lists.
+        tables: caption and content, by file name.
+        figures: by file name.
+        models: models whose fit status is listed on the page.
     """
 
     title: str
@@ -171,7 +171,7 @@ SWING_UP = "control_swing_up"
 
 
 def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
-    """Caption and content of every table, by the name of its file."""
+    """Caption and content of every table, by file name."""
     return {
         name: (caption, make(workspace))
         for item in ITEMS
@@ -234,7 +234,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
 
 
 def write_page(workspace: Workspace) -> Path:
-    """Write `reproduction.html` with the tables, and the figures that were drawn."""
+    """Write `reproduction.html` with the tables and the figures that were drawn."""
     made = all_tables(workspace)
     parts = [
         (title, [_rendered(workspace, made, item) for item in items]) for title, items in PARTS
@@ -251,7 +251,7 @@ def write_page(workspace: Workspace) -> Path:
 def _rendered(
     workspace: Workspace, made: Mapping[str, tuple[str, pd.DataFrame]], item: Item
 ) -> dict[str, Any]:
-    """An item's tables with cells of text, and its pictures as URLs."""
+    """An item's tables with cells as text, and its pictures as URLs."""
     ends = [f"{name}: {workspace.found(name)['fit']['status']}" for name in item.models]
     shown = [made[name] for name in item.tables]
     pictures = {
@@ -269,12 +269,12 @@ def _rendered(
 
 
 def _shown(caption: str, table: pd.DataFrame) -> pd.DataFrame:
-    # Coefficients stay in SI; errors are read in thousandths.
+    # Coefficients stay in SI; errors are shown in thousandths.
     return 1e3 * table if "[mrad]" in caption else table
 
 
 def _flat(table: pd.DataFrame) -> pd.DataFrame:
-    # One header row, so that any reader of CSV can read it.
+    # One header row, so that any CSV reader can read it.
     return table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
 
 
