@@ -40,7 +40,7 @@ class Incomparable(CodegenError):  # noqa: N818
 
 
 class UpdateRate(IntEnum):
-    """How often a value has to be computed; lower values mean less often."""
+    """Frequency at which a value has to be computed; lower values mean less often."""
 
     CONSTANT = 0
     PARAMETER = 1
