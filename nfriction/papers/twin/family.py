@@ -70,19 +70,19 @@ class Parameter(NamedTuple):
 PARAMETERS = {
     "dry": Parameter("", (0.03, 0.02, 0.01), (0.06, 0.04, 0.02), 0.0, "F [N m], dry friction"),
     "viscous": Parameter("", (0.03, 0.02, 0.015), (0.06, 0.04, 0.03), 0.0, "B [N m s/rad]"),
-    "share": Parameter("load", 0.5, 1.0, 0.0, "a, share of dry friction that follows the load"),
-    "lean": Parameter("direction", 0.1, 0.3, 0.0, "d, of the direction of turning", signed=True),
-    "thin_from": Parameter("shear", 1.0, 4.0, np.inf, "v_t [rad/s], where B has fallen to half"),
+    "share": Parameter("load", 0.5, 1.0, 0.0, "a, load-dependent share of dry friction"),
+    "lean": Parameter("direction", 0.1, 0.3, 0.0, "d, asymmetry with direction", signed=True),
+    "thin_from": Parameter("shear", 1.0, 4.0, np.inf, "v_t [rad/s], at which B is halved"),
     "thinning": Parameter("shear", 0.7, 1.3, 1.0, "m, exponent of Cross's law"),
-    "capacity": Parameter("warming", 2.0, 5.0, np.inf, "C [J], heat that lowers friction e times"),
-    "cooling": Parameter("warming", 5.0, 20.0, 1.0, "T [s], of cooling"),
-    "slip": Parameter("bristle", 0.03, 0.08, 0.0, "x [rad], bend at which bristles slip"),
-    "ripple": Parameter("ripple", 0.2, 0.5, 0.0, "r, of the position"),
-    "waves": Parameter("ripple", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0, "k, waves in a turn"),
+    "capacity": Parameter("warming", 2.0, 5.0, np.inf, "C [J], heat that divides friction by e"),
+    "cooling": Parameter("warming", 5.0, 20.0, 1.0, "T [s], time constant of cooling"),
+    "slip": Parameter("bristle", 0.03, 0.08, 0.0, "x [rad], deflection at which bristles slip"),
+    "ripple": Parameter("ripple", 0.2, 0.5, 0.0, "r, amplitude over the position"),
+    "waves": Parameter("ripple", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0, "k, waves per revolution"),
     "phase": Parameter("ripple", 0.0, 2 * np.pi, 0.0, "p [rad]"),
-    "rise": Parameter("lag", 0.5, 1.0, 0.0, "b, dry friction at rest over that in motion, less 1"),
+    "rise": Parameter("lag", 0.5, 1.0, 0.0, "b, dry friction at rest over that in motion, minus 1"),
     "film": Parameter("lag", 0.5, 1.5, 1.0, "v_s [rad/s], over which a film builds up"),
-    "lag": Parameter("lag", 0.02, 0.06, 1.0, "T_u [s], by which the film follows the velocity"),
+    "lag": Parameter("lag", 0.02, 0.06, 1.0, "T_u [s], lag of the film behind the velocity"),
 }
 TRUTHS = tuple(dict.fromkeys(p.effect for p in PARAMETERS.values() if p.effect))
 PLAIN = "plain"
@@ -330,11 +330,11 @@ Friction: {" and ".join(effects) or "dry and viscous"}; the equations are in
 |---|---|---|
 {rows}
 
-Encoders of 2048 lines, four counts each; files as in the card of `tlrip_twin`. Releases at rest:
+Encoders with 2048 lines, four counts each; files as in the card of `tlrip_twin`. Releases at rest:
 
 | id | angles [deg] |
 |---|---|
 {starts}
 
-A count at every joint of a test release grows to at most {PREDICTABLE} counts.
+An error of one count at every joint of a test release grows to at most {PREDICTABLE} counts.
 """
