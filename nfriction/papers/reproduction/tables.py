@@ -323,7 +323,7 @@ def conclusion(workspace: Workspace) -> str:
         ),
         str(order(workspace)),
         claim(
-            "networks taught by a fuzzy controller, the papers' own way, have smaller errors than "
+            "networks trained on a fuzzy controller, the papers' method, have smaller errors than "
             f"coefficients by class, {said(PAPERS_WAY)}",
             PAPERS_WAY, ADAPTIVE,
         ),
@@ -332,9 +332,9 @@ def conclusion(workspace: Workspace) -> str:
             (five,) * len(simple), simple,
         ),
         f"Why: a curve over speed fails to explain {missed['speed']:.1%} of the true friction "
-        "torque, a surface over speed and acceleration, the inputs of the papers' networks, "
+        "torque, a surface over speed and acceleration (the inputs of the papers' networks) "
         f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
-        f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
+        f"{len(TLRIP) + len(SECOND_PAPER)} fits did not converge.",
     ]  # fmt: skip
     return "\n".join(lines)
 
