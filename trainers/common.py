@@ -86,7 +86,7 @@ def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
         shutil.rmtree(folder, ignore_errors=True)
     elif workspace.begun("options") and workspace.result("options") is None:
         raise ValueError(
-            f"{folder}: made with other options; repeat them, or start anew without --resume."
+            f"{folder}: made with other options; use the same ones, or start again without --resume."
         )
     workspace.finish("options", made.to_dict())
     return workspace
@@ -165,7 +165,7 @@ def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
 
 def _end(folder: Path) -> NoReturn:
     # On KeyboardInterrupt solvers keep their best point, which would look like a finished stage.
-    sys.stderr.write(f"\ninterrupted; what was reached is in {folder}, go on with --resume\n")
+    sys.stderr.write(f"\ninterrupted; progress is saved in {folder}, resume with --resume\n")
     sys.exit(INTERRUPTED)
 
 

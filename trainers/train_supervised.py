@@ -73,7 +73,7 @@ def train(argv: Sequence[str] | None) -> str:
     common.draw_losses(losses, given.out / f"{path.stem}-loss.png")
     _outputs(samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
     lines = [
-        f"{path.stem}: {len(samples)} samples a joint, {given.units} units",
+        f"{path.stem}: {len(samples)} samples per joint, {given.units} units",
         *ended,
         *(
             f"{joint}: error of the network [% of the output's range] "

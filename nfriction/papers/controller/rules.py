@@ -108,7 +108,7 @@ class RuleBase:
     """Variables and rules of a Mamdani controller, validated.
 
     Args:
-        name: what the controller is for.
+        name: purpose of the controller.
         inputs, outputs: variables, in the order in which rules name their terms.
         rules: in any order.
     """

@@ -112,8 +112,8 @@ FIRST = (
          tables={
              "table_11": ("Table 11: error reduction by NFNLFM relative to each other model [%], "
                           "median of ten fresh releases", tables.table_11),
-             "error_saved": ("error reduction by coefficients by class and by networks for each law "
-                             "[%], median of ten fresh releases", tables.steps_saved)}),
+             "error_saved": ("error reduction by coefficients by class and by networks for each "
+                             "law [%], median of ten fresh releases", tables.steps_saved)}),
 )  # fmt: skip
 SECOND = (
     Item("Fig. 3: four joints from 0°, 20°, 30°, 40°",
