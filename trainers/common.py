@@ -86,7 +86,7 @@ def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
         shutil.rmtree(folder, ignore_errors=True)
     elif workspace.begun("options") and workspace.result("options") is None:
         raise ValueError(
-            f"{folder}: made with other options; use the same ones, or start again without --resume."
+            f"{folder}: made with other options; use the same, or start again without --resume."
         )
     workspace.finish("options", made.to_dict())
     return workspace
