@@ -1,4 +1,4 @@
-"""Build a data set of simulated rigs into a folder; the cards beside this file describe them.
+"""Build a data set of simulated rigs in a folder; the cards in this folder describe them.
 
 python datasets/build.py tlrip_twin --out runs/tlrip_twin
 """

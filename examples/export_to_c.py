@@ -1,4 +1,4 @@
-"""Write a friction model as C for a controller, compile it, and let it test itself."""
+"""Write a friction model as C code for a controller, compile it, and run its self-test."""
 
 import argparse
 import shutil
@@ -15,7 +15,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/export_to_c"))
     arguments = parser.parse_args(argv)
 
-    # As `nfriction.load("model.json")` would give it; untrained, it is its constant law.
+    # In practice `nfriction.load("model.json")`; an untrained model equals its constant law.
     model = NFLFM(3, [2e-3, 5e-3])
     info = ModelInfo(
         joint_names=("joint2", "joint3", "joint4"), sample_time=1e-3,

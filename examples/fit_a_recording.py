@@ -1,4 +1,4 @@
-"""Fit two friction models to a recording, judge them on another one, save the better one."""
+"""Fit two friction models to a recording, test them on another one, save the better one."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/fit_a_recording"))
     arguments = parser.parse_args(argv)
 
-    # A simulated rig in place of yours; its files look like an encoder log.
+    # A simulated rig instead of yours; its files look like an encoder log.
     simulated = twin.make("tlrip", duration=2.0 if arguments.quick else 10.0)
     files = {}
     for part in ("train", "test"):
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         files[part].parent.mkdir(parents=True, exist_ok=True)
         recording.write(files[part])
 
-    rig = simulated.plant  # of your own rig: rigs.read("rig.json")
+    rig = simulated.plant  # for your own rig: rigs.read("rig.json")
     train, test = (Recording.read(files[part]) for part in ("train", "test"))
     errors = {}
     for model in (NCFM(rig.joints), LFM(rig.joints)):

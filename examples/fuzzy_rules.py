@@ -1,4 +1,4 @@
-"""Rules of your own as a table, the surface they make, and a network that learns them."""
+"""Your own rules as a table, the resulting surface, and a network that learns them."""
 
 import argparse
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"IF {given} THEN B, C are {then}")
     controller_surface(controller).savefig(arguments.out / "surface.png", dpi=150)
 
-    # Few steps and samples suffice for a look; the papers take 40,000 samples.
+    # Few steps and samples suffice for a demonstration; the papers use 40,000 samples.
     network = RBFNetwork(1, 2, 10, 2)
     samples, steps = (500, 3) if arguments.quick else (4000, 30)
     options = TrainingOptions(max_steps=steps)

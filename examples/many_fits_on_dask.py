@@ -1,6 +1,6 @@
-"""Many fits on a Dask cluster: one a recording, and a comparison of models.
+"""Many fits on a Dask cluster: one per recording, and a comparison of models.
 
-Needs `pip install nfriction[dask]`, on the workers too. Without --scheduler the cluster is this
+Needs `pip install nfriction[dask]`, also on the workers. Without --scheduler, the cluster is this
 machine.
 """
 
@@ -21,8 +21,8 @@ QUICK = {"fit_plant": False, "windows": (0.5,), "max_steps": 1}
 
 
 def coefficients(rig: Plant, recording: Recording, settings: dict) -> dict[str, float]:
-    """Intervals' middles of one recording's own fit, done on some worker."""
-    torch.set_num_threads(1)  # a worker has one, and small tensors want no more
+    """Estimates from the fit of one recording, run on one of the workers."""
+    torch.set_num_threads(1)  # a worker has one, and small tensors need no more
     found = fit(LFM(rig.joints), rig, recording, **settings)
     return {"converged": found.converged} | {i.name: i.value for i in found.intervals}
 
@@ -43,12 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     with ExitStack() as stack:
         cluster = arguments.scheduler
         if cluster is None:
-            # One thread a worker: fits share nothing, and compiled code has its own.
+            # One thread per worker: fits share nothing, and compiled code has its own threads.
             cluster = stack.enter_context(
                 LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
             )
         client = stack.enter_context(Client(cluster))
-        # All that joblib does in here is done by the cluster, also what nfriction asks of it.
+        # In this block, joblib runs everything on the cluster, including calls from nfriction.
         stack.enter_context(joblib.parallel_config(backend="dask"))
 
         fits = joblib.Parallel()(

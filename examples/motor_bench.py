@@ -9,7 +9,7 @@ import torch
 
 from nfriction import CVFM, Motor, Recording, Rotor, fit, rigs, rollout
 
-COUNTS = 8192  # of a turn of the motor
+COUNTS = 8192  # per motor revolution
 MOTOR = Motor(gear_ratio=50, rotor_inertia=1.2e-5, torque_constant=0.03)
 BENCH = Rotor(inertia=0.02, motor=MOTOR, name="wheel", position_quantum=2 * np.pi / COUNTS / 50)
 TRUTH = [0.35, 0.12]  # F_c [N m], F_v [N m s/rad], at the joint
@@ -39,9 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def write_log(path: Path, seed: int, seconds: float) -> None:
-    """Write a run with a current of four sines, as a drive with German settings logs it."""
+    """Write a log of a run with a four-sine current, as from a drive with German settings."""
     rng = np.random.default_rng(seed)
-    steps, every = round(seconds / 5e-4), 4  # four steps of the simulation to each sample
+    steps, every = round(seconds / 5e-4), 4  # four simulation steps per sample
     sample = np.arange(steps // every) * every * 5e-4
     frequency, phase = rng.uniform(0.2, 2.0, (4, 1)), rng.uniform(0, 2 * np.pi, (4, 1))
     current = 0.35 * np.sin(2 * np.pi * frequency * sample + phase).sum(0)

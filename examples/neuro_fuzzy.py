@@ -1,4 +1,4 @@
-"""Learn a joint whose friction follows the motion; read what was learnt as rules in words."""
+"""Learn friction that depends on the motion of a joint; show the result as rules in words."""
 
 import argparse
 import copy

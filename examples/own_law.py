@@ -1,4 +1,4 @@
-"""A friction law of your own: one function, and fits, rollouts and exports work for it."""
+"""Your own friction law: define one function; fits, rollouts and exports work with it."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from nfriction.friction.laws import Coefficient, Law
 
 
 def sticky(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Coulomb friction, and a part that grows with the square of the velocity."""
+    """Coulomb friction, and a term that grows with the square of the velocity."""
     coulomb, square = coefficients.unbind(-1)
     return coulomb * torch.tanh(qd / v_smooth) + square * qd * qd.abs()
 
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def swing(plant: PendulumChain, friction: FrictionModel, seconds: float) -> Recording:
-    """A release from rest, as an encoder sees it."""
+    """A release from rest, as measured by an encoder."""
     q0 = torch.tensor([np.pi + 2.0], dtype=torch.float64)
     run = rollout(plant, friction, q0, 0 * q0, sample_time=1e-3, steps=round(1e3 * seconds))
     q = np.round(run.q.numpy() / 1e-4) * 1e-4

@@ -1,4 +1,4 @@
-"""Describe a rig of your own, read a log in degrees with decimal commas, fit its friction."""
+"""Describe your own rig, read a log in degrees with decimal commas, and fit its friction."""
 
 import argparse
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ TRUTH = np.array([[6e-4, 2e-3], [2e-4, 5e-4]])
 
 
 def write_log(path: Path, seconds: float) -> None:
-    """Write a release from rest as a logger with German settings does."""
+    """Write a log of a release from rest, as from a logger with German settings."""
     q0 = torch.tensor([np.pi + 1.2, 0.4], dtype=torch.float64)  # joints: relative, from upright
     friction = LFM(2, TRUTH.tolist()).requires_grad_(False)
     run = rollout(BENCH, friction, q0, 0 * q0, sample_time=2e-3, steps=round(seconds / 2e-3))

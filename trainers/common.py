@@ -1,4 +1,4 @@
-"""Shared by the scripts in `trainers/`: options, recordings, and the end of a run."""
+"""Shared code of the scripts in `trainers/`: options, recordings, and the end of a run."""
 
 import argparse
 import json
@@ -28,7 +28,7 @@ from nfriction.recording.angles import AngleConvention
 
 # Options that do not change the result.
 _IRRELEVANT = ("out", "resume")
-# Exit status that shells expect of a program that Ctrl-C ended.
+# Exit status that shells expect of a program ended by Ctrl-C.
 INTERRUPTED = 130
 
 
@@ -36,22 +36,24 @@ def parser(description: str) -> argparse.ArgumentParser:
     """A parser with the options that all trainers have."""
     made = argparse.ArgumentParser(description=description)
     made.add_argument("recordings", nargs="*", type=Path, metavar="RECORDING",
-                      help="files with time, q1, q2, ...; none for a simulated twin")  # fmt: skip
+                      help="files with time, q1, q2, ...; omit for a simulated twin")  # fmt: skip
     made.add_argument("--twin", choices=twin.names(), default="tlrip",
-                      help="the twin, where no recording is given")  # fmt: skip
+                      help="the twin to use if no recording is given")  # fmt: skip
     made.add_argument("--seconds", type=float, help="length of the twin's recordings [s]")
     made.add_argument("--rig", help=f"a rig file, or one of {', '.join(rigs.names())}")
-    made.add_argument("--angles", help="how the files write angles, e.g. absolute,hanging")
+    made.add_argument("--angles", help="angle convention of the files, e.g. absolute,hanging")
     made.add_argument("--degrees", action="store_true", help="the files are in degrees")
     made.add_argument("--plant", choices=("fit", "given"), default="given",
-                      help="adjust inertia and gravity terms within bounds, or not")  # fmt: skip
+                      help="fit: adjust inertia and gravity terms within bounds")  # fmt: skip
     made.add_argument("--windows", type=float, nargs="+", default=[0.5, 2.0], metavar="SECONDS",
                       help="lengths of the fitted windows")  # fmt: skip
-    made.add_argument("--max-steps", type=int, default=30, help="of the fit, at each length")
+    made.add_argument(
+        "--max-steps", type=int, default=30, help="limit on steps of the fit at each window length"
+    )
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--out", type=Path, default=Path("runs/train"), help="folder to write")
     made.add_argument("--resume", action="store_true",
-                      help="go on from the checkpoints in the folder")  # fmt: skip
+                      help="resume from the checkpoints in the folder")  # fmt: skip
     return made
 
 
@@ -59,8 +61,8 @@ def start(given: argparse.Namespace, **settings: object) -> tuple[Workspace, Ben
     """The checkpoints of a run and its recordings.
 
     Args:
-        given: of a `parser()`.
-        settings: further `Settings` than those that all trainers have.
+        given: parsed options of a `parser()`.
+        settings: `Settings` in addition to those common to all trainers.
 
     Raises:
         ValueError: if the checkpoints to resume from were made with other options.
@@ -71,7 +73,7 @@ def start(given: argparse.Namespace, **settings: object) -> tuple[Workspace, Ben
 
 
 def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
-    """Checkpoints that `--resume` goes on from, or none."""
+    """Checkpoints from which `--resume` continues, or none."""
     options = {k: v for k, v in vars(given).items() if k not in _IRRELEVANT}
     made = Settings(
         seed=given.seed, windows=tuple(given.windows), max_steps=given.max_steps,
@@ -84,14 +86,14 @@ def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
         shutil.rmtree(folder, ignore_errors=True)
     elif workspace.begun("options") and workspace.result("options") is None:
         raise ValueError(
-            f"{folder}: made with other options; repeat them, or start anew without --resume."
+            f"{folder}: made with other options; use the same, or start again without --resume."
         )
     workspace.finish("options", made.to_dict())
     return workspace
 
 
 def _bench(given: argparse.Namespace) -> Bench:
-    """The recordings given, or the twin's; files given are all trained on."""
+    """The given recordings, all used for training, or those of the twin."""
     if not given.recordings:
         made = twin.make(
             given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
@@ -138,10 +140,10 @@ def write(
 
 
 def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
-    """Draw the loss over the steps of a training, a line a part of it.
+    """Draw the loss over the steps of a training, one line for each part.
 
-    Parts differ in what they sum over, so that each is shown relative to its first loss. Where the
-    evidence weighs the data anew between steps, a line may rise.
+    Parts sum over different terms, so each is shown relative to its first loss. A line may rise if
+    the evidence changes the weight of the data between steps.
     """
     figure, axes = style.panels(1, 1, style.PAGE, 2.4)
     looks, ax = style.looks(losses), axes[0, 0]
@@ -162,14 +164,14 @@ def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
 
 
 def _end(folder: Path) -> NoReturn:
-    # Solvers keep their best point on a KeyboardInterrupt, which would pass for a finished stage.
-    sys.stderr.write(f"\ninterrupted; what was reached is in {folder}, go on with --resume\n")
+    # On KeyboardInterrupt solvers keep their best point, which would look like a finished stage.
+    sys.stderr.write(f"\ninterrupted; progress is saved in {folder}, resume with --resume\n")
     sys.exit(INTERRUPTED)
 
 
 def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> None:
-    """Run a trainer on one thread and print its report; errors end it with one line."""
-    # Several threads make small tensors up to 100 times slower.
+    """Run a trainer on one thread and print its report; errors are reported in one line."""
+    # Multithreading makes operations on small tensors up to 100 times slower.
     torch.set_num_threads(1)
     try:
         print(train(argv))

@@ -2,9 +2,9 @@
 
     python trainers/evolve_rules.py --twin tlrip --joint 2 --out runs/evolve
 
-Coefficients by class span a controller with the papers' rules; evolution moves its ranges and the
-terms of its rules and leaves rules out. Writes the Pareto front as table and figure, judged on
-recordings that took no part. `--resume` goes on after the last finished generation.
+Coefficients by class define the output ranges of a controller with the papers' rules; evolution
+varies its ranges and the terms of its rules, and omits rules. Writes the Pareto front as table and
+figure, tested on recordings not used for tuning. `--resume` continues after the last generation.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from nfriction.plots import style
 from nfriction.signals import Motion
 
 MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
-# One sample of this many is taken, and errors are averaged over blocks: 50 ms at 1 kHz.
+# Every fifth sample is used, and errors are averaged over blocks of ten: 50 ms at 1 kHz.
 THINNED, BLOCK = 5, 10
 
 
@@ -87,13 +87,13 @@ def _samples(plant: Plant, motions: Sequence[Motion], joint: int) -> TorqueSampl
     )
     q, qd, qdd = q[::THINNED], qd[::THINNED], qdd[::THINNED]
     with torch.no_grad():
-        # Without a drive, friction is what the motion lacks.
+        # Without a drive, friction is the negative of the torque from inverse dynamics.
         torque, load = -plant.inverse_dynamics(q, qd, qdd), plant.load(q, qd)
     return TorqueSamples(qd[:, joint], qdd[:, joint], load[:, joint], torque[:, joint], BLOCK)
 
 
 def _draw(table: pd.DataFrame) -> "style.Figure":
-    """Errors over the number of rules, the controller as given marked."""
+    """Errors over the number of rules, with the initial controller marked."""
     figure, axes = style.panels(1, 1, style.PAGE, 2.6)
     ax, front = axes[0, 0], table.iloc[1:]
     columns = table.columns[1:]

@@ -1,13 +1,13 @@
-"""Let the papers' network learn online while friction drifts, beside the same network frozen.
+"""Let the papers' network learn online while friction drifts; compare with the frozen network.
 
     python trainers/learn_online.py
     python trainers/learn_online.py --seconds 120 --fall 0.5 --out runs/online
 
-The rig is the control study's link on its driven arm, hanging, with a random torque at the arm. A
-network is set to the linear law fitted to a cold recording. Then the arm's friction falls as it
-warms. The friction torque that teaches the network is the motor's less that of inertia and gravity,
-by the filters of a controller from encoder counts. Prints the error of both torques against the
-true one, and writes the figure, the model and its C.
+The rig is the hanging link on its driven arm from the control study, with a random torque at the
+arm. A network is set to the linear law fitted to a cold recording. Then the arm's friction falls as
+it warms up. The network learns from the motor torque minus that of inertia and gravity, computed
+from encoder counts with the filters of a controller. Prints the errors of both torques relative to
+the true one, and writes the figure, the model and its C code.
 """
 
 import argparse
@@ -35,8 +35,8 @@ from nfriction.signals import Motion, SecondOrderLowPass, causal_motion
 
 COLD_SECONDS = 12.0
 CUTOFF = 20.0  # of the controller's filters [Hz]
-EVERY = 5  # samples from one that is learnt to the next
-BLOCK = 10.0  # of the table [s]
+EVERY = 5  # one of this many samples is learnt
+BLOCK = 10.0  # duration of a row of the table [s]
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -51,7 +51,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--seed", type=int, default=0, help="of the motor's torque")
     parser.add_argument("--out", type=Path, default=Path("runs/online"), help="folder to write")
     given = parser.parse_args(argv)
-    # A row of the table is a whole block.
+    # A row of the table is a full block.
     if given.seconds < BLOCK:
         parser.error(f"--seconds must be at least {BLOCK:g}, got {given.seconds:g}.")
     plant = study.single_link()
@@ -67,7 +67,7 @@ def train(argv: Sequence[str] | None) -> str:
     qd, qdd = (x[first].numpy() for x in motion[:2])
     place_units(model.schedule, values, values, [Motion(np.arange(len(qd)) / 1000, qd, qd, qdd)])
     before = motion[3][first] - model(*(x[first] for x in motion[:3]))
-    # Neighbouring errors are alike, so that a sample of a second's errors is worth about one.
+    # Neighbouring errors are correlated, so one second of samples is worth about one sample.
     options = OnlineOptions(
         noise=float(before[1000:, 0].square().mean().sqrt()) * (0.2 / (EVERY * 1e-3)) ** 0.5,
         forgetting=given.forgetting, sample_time=EVERY * 1e-3,
@@ -93,10 +93,10 @@ def train(argv: Sequence[str] | None) -> str:
 def _warming_motion(
     plant: PendulumChain, given: argparse.Namespace
 ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """Velocity, acceleration, load and measured friction torque, and the true one (sample, joint).
+    """Velocity, acceleration, load, measured and true friction torque, each (sample, joint).
 
-    Torque, position and velocity pass the filters that the acceleration has passed, so that all lag
-    alike.
+    Torque, position and velocity pass through the same filters as the acceleration, so that all
+    have the same delay.
     """
     friction, seconds = study.true_friction(plant), round(given.seconds)
     random = np.random.default_rng([given.seed, 1])
@@ -111,7 +111,7 @@ def _warming_motion(
     for second in range(seconds):
         left = 1 - given.fall * (1 - np.exp(-second / given.warming))
         warm = whole.clone()
-        # Dry parts and viscosity; the rest are velocities and ratios.
+        # Dry and viscous terms; the others are velocities and ratios.
         warm[0, [0, 1, 5]] *= left
         friction.schedule.set_coefficients(warm)
         part = tau[1000 * second : 1000 * (second + 1)]
@@ -135,7 +135,7 @@ def _warming_motion(
 
 
 def _table(errors: np.ndarray, true: np.ndarray) -> pd.DataFrame:
-    """Errors by block of time, a column each."""
+    """Errors by block of time, one column each."""
     size = round(BLOCK / (EVERY * 1e-3))
     rows = {}
     for start in range(0, len(errors) - size + 1, size):

@@ -3,9 +3,9 @@
     python trainers/train_adaptive.py run1.csv run2.csv --rig rig.json --model ALFM
     python trainers/train_adaptive.py --twin tlrip --model ANLFM --method pattern
 
-After a Ctrl-C or a kill, `--resume` reads the constant fit, which comes first, where it was
-finished; a pattern search continues from its last iteration, the other methods start their stage
-again. The result is that of an uninterrupted run.
+After Ctrl-C or a kill, `--resume` reads the constant fit, which comes first, if it was finished; a
+pattern search continues from its last iteration, and the other methods restart their stage. The
+result is that of an uninterrupted run.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--model", choices=MODELS, default="ALFM")
     parser.add_argument("--method", choices=("gauss-newton", "pattern", "sqp"),
                         default="gauss-newton")  # fmt: skip
-    parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
+    parser.add_argument("--max-evaluations", type=int, default=5000, help="limit for a search")
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "gauss-newton":

@@ -1,11 +1,11 @@
-"""Train a model with constant coefficients on recordings of 40 s, or as the second paper did.
+"""Train a model with constant coefficients on recordings of 40 s, or like the second paper.
 
     python trainers/train_constant.py run1.csv run2.csv --rig rig.json --model NLFM
     python trainers/train_constant.py --twin rtip --model NCFM --method sqp
     python trainers/train_constant.py --twin rtip --model LFM --method pattern
 
-The last two are the second paper's estimation (80 s): NCFM by sequential quadratic programming,
-LFM and NLFM by pattern search of the simulated position. After a Ctrl-C or a kill, `--resume`
+The last two repeat the second paper's estimation (80 s): NCFM by sequential quadratic programming,
+LFM and NLFM by pattern search on the simulated position. After Ctrl-C or a kill, `--resume`
 continues a pattern search from its last iteration; the other methods, which take seconds to
 minutes, start again. The result is that of an uninterrupted run.
 """
@@ -25,7 +25,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--method", choices=("trajectory", "pattern", "sqp"), default="trajectory")
     parser.add_argument("--horizon", type=float, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip
-    parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
+    parser.add_argument("--max-evaluations", type=int, default=5000, help="limit for a search")
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "trajectory":

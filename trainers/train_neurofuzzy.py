@@ -1,12 +1,12 @@
-"""Train a neuro-fuzzy model, our way or by the first paper's own procedure.
+"""Train a neuro-fuzzy model by our method or by the first paper's own procedure.
 
     python trainers/train_neurofuzzy.py run1.csv run2.csv --rig rig.json --model NFLFM
     python trainers/train_neurofuzzy.py --twin tlrip --model NFNLFM --procedure papers
 
-Both fit the constant law first. Ours corrects it by an ANFIS layer with a radial basis head, on
-trajectories. The papers then fit coefficients by class of acceleration, span a fuzzy controller
-with them and train a radial basis network on its outputs for 40,000 samples a joint. After a
-Ctrl-C or a kill, `--resume` reads the stages that were finished and starts the others again, with
+Both fit the constant law first. Our method corrects it by an ANFIS layer with a radial basis head,
+fitted to trajectories. The papers fit coefficients by class of acceleration, use them as the output
+ranges of a fuzzy controller, and train a radial basis network on its outputs for 40,000 samples per
+joint. After Ctrl-C or a kill, `--resume` reads the finished stages and restarts the others, with
 the same result.
 """
 
@@ -33,9 +33,9 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--model", choices=MODELS, default="NFLFM")
     parser.add_argument("--procedure", choices=("ours", "papers"), default="ours")
     parser.add_argument("--samples", type=int, default=40_000,
-                        help="of the papers' controller, a joint")  # fmt: skip
+                        help="of the papers' controller, per joint")  # fmt: skip
     parser.add_argument("--terms", type=int, nargs=2, default=[5, 5], metavar="SETS",
-                        help="fuzzy sets of velocity and of acceleration, ours")  # fmt: skip
+                        help="fuzzy sets of velocity and of acceleration (our method)")  # fmt: skip
     parser.add_argument("--units", type=int, default=10, help="of the radial basis network")
     given = parser.parse_args(argv)
     if given.model == WITHOUT_CLASSES and given.procedure == "papers":

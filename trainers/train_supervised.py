@@ -3,11 +3,11 @@
     python trainers/train_supervised.py
     python trainers/train_supervised.py --adaptive runs/papers/models/ANLFM.json --units 12
 
-The data set is `tlrip_controller`: 40,000 samples a joint of velocity, acceleration and the outputs
-of the papers' own controllers, coefficients B and C of the linear law. `--adaptive` takes
-controllers that the coefficients by class of an adaptive model span instead, of any law, along the
-same motion. Writes the model with its TorchScript, a figure of the loss by step and one of what
-the networks learnt. A run takes about a minute and starts again after an interruption.
+The data set is `tlrip_controller`: 40,000 samples per joint of velocity, acceleration and the
+outputs of the papers' own controllers, coefficients B and C of the linear law. With `--adaptive`,
+the controllers are instead spanned by the coefficients by class of an adaptive model of any law,
+along the same motion. Writes the model with its TorchScript, a figure of the loss by step and one
+of the learnt outputs. A run takes about a minute; after an interruption it starts again.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from nfriction.plots import style
 from nfriction.signals import Motion
 
 MODELS = tuple(name for name in model_names() if name.startswith("NF"))
-SHOWN_SECONDS = 12.0  # of the motion: later it has almost died out
+SHOWN_SECONDS = 12.0  # of the motion, which has almost stopped later
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -43,8 +43,10 @@ def train(argv: Sequence[str] | None) -> str:
                         help="adaptive model file whose classes span the controllers")  # fmt: skip
     parser.add_argument("--units", type=int, default=10, help="of each network")
     parser.add_argument("--max-steps", type=int, default=100, help="of Bayesian regularisation")
-    parser.add_argument("--starts", type=int, default=1, help="the best by evidence is taken")
-    parser.add_argument("--seconds", type=float, help="of the motion; by default its 40 s")
+    parser.add_argument(
+        "--starts", type=int, default=1, help="number of starts; the best by evidence is kept"
+    )
+    parser.add_argument("--seconds", type=float, help="duration of the motion; default 40 s")
     parser.add_argument("--seed", type=int, default=0, help="of encoders and starts")
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
@@ -71,7 +73,7 @@ def train(argv: Sequence[str] | None) -> str:
     common.draw_losses(losses, given.out / f"{path.stem}-loss.png")
     _outputs(samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
     lines = [
-        f"{path.stem}: {len(samples)} samples a joint, {given.units} units",
+        f"{path.stem}: {len(samples)} samples per joint, {given.units} units",
         *ended,
         *(
             f"{joint}: error of the network [% of the output's range] "
@@ -109,7 +111,7 @@ def _data(
 
 
 def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
-    """Outputs of controller and network along the motion, a column a joint."""
+    """Outputs of controller and network along the motion, one column per joint."""
     shown = samples.time <= SHOWN_SECONDS
     count = len(samples.output_names)
     figure, axes = style.panels(

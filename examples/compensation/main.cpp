@@ -1,5 +1,5 @@
-// Friction compensation on a simulated motor: what the gain and the velocity that the model is
-// asked at do to a position loop. Build it with the C of `nfriction export`, see README.md.
+// Friction compensation on a simulated motor: effect of the gain and of the velocity given to the
+// model on a position loop. Build it with the C code from `nfriction export`, see README.md.
 #include <cmath>
 #include <cstdio>
 
@@ -9,9 +9,9 @@ namespace {
 
 constexpr double kPi = 3.141592653589793;
 constexpr double kPeriod = 1e-3;  // of the controller [s]
-constexpr int kSteps = 20;        // of the simulation to each of its samples
+constexpr int kSteps = 20;        // simulation steps per controller sample
 constexpr double kInertia = 0.05, kStiffness = 40.0, kDamping = 2.0;
-constexpr double kCount = 2 * kPi / 8192 / 50;  // an encoder behind a gear of 50
+constexpr double kCount = 2 * kPi / 8192 / 50;  // an encoder on the motor, gear ratio 50
 constexpr double kDeadBand = 0.05;              // [rad/s]
 
 enum class Velocity { none, measured, faded, desired };
@@ -30,7 +30,7 @@ double friction_at(double qd) {
     return static_cast<double>(model.step(v, none, load).tau[0]);
 }
 
-// The torque to add to the drive's. A model of friction brakes: it is added, not subtracted.
+// The torque to add to that of the drive. Friction torque brakes, so it is added, not subtracted.
 double compensation(const Case &chosen, double measured, double desired) {
     switch (chosen.velocity) {
         case Velocity::measured:
@@ -61,7 +61,7 @@ void run(const Case &chosen) {
         const double read = std::round(q / kCount) * kCount;
         filtered += 0.3 * ((read - last) / kPeriod - filtered);
         last = read;
-        // The drive gives the torque one sample later.
+        // The drive applies the torque one sample later.
         const double next = kInertia * push + kStiffness * (want - read)
             + kDamping * (rate - filtered) + compensation(chosen, filtered, rate);
         for (int i = 0; i < kSteps; ++i) {

@@ -1,4 +1,4 @@
-// A reader for the JSON that an artefact carries: just enough of it, and no more.
+// A minimal reader for the JSON metadata in an artefact.
 #pragma once
 
 #include <cstdlib>
@@ -21,7 +21,7 @@ struct Json {
         return found->second;
     }
 
-    // Numbers that JSON does not know are spelled "nan", "inf" and "-inf".
+    // Numbers that JSON does not support are written as "nan", "inf" and "-inf".
     double value() const {
         if (kind == Number) return number;
         if (text == "nan") return std::numeric_limits<double>::quiet_NaN();
@@ -120,7 +120,7 @@ private:
         return json;
     }
 
-    // Escapes are kept as they are: no name that matters here has one.
+    // Escapes are kept unchanged: no relevant name contains one.
     std::string string() {
         expect('"');
         const std::size_t start = at_;

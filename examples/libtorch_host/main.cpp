@@ -1,9 +1,9 @@
-// Host of a friction model in C++: load the artefact, prove it by the vectors it carries, run it.
+// C++ host of a friction model: load the artefact, verify it with its test vectors, run it.
 //
 //   libtorch_host model.pt [calls [microseconds.txt]]
 //
-// The last file is given the time of every call.
-// Exit status 0 if the artefact is what it says, 1 if not, 2 if it cannot be read.
+// The last file receives the time of every call.
+// Exit status: 0 if the artefact passes its tests, 1 if not, 2 if it cannot be read.
 
 #include <ATen/Parallel.h>
 #include <torch/script.h>
@@ -44,7 +44,7 @@ static std::vector<Tensor> inputs_of(const Json &metadata) {
     return inputs;
 }
 
-// Torque, coefficients and status of every vector; with a state, of one after the other.
+// Torque, coefficients and status for every vector; with a state, one after another.
 static std::vector<Tensor> run(torch::jit::Module &module, const std::vector<Tensor> &inputs,
                                bool has_state) {
     const auto step = module.get_method("step");
@@ -87,7 +87,7 @@ static bool verify(torch::jit::Module &module, const Json &metadata) {
     return error <= tolerance && edges == 0;
 }
 
-// One call of a control loop: one sample of every joint, the torque alone.
+// One call of a control loop: one sample of every joint, only the torque.
 static std::vector<double> time_calls(torch::jit::Module &module, int64_t joints, int calls) {
     const auto full = [joints](double value) {
         return torch::full({joints}, value, torch::kFloat64);
@@ -122,7 +122,7 @@ int main(int argc, char **argv) {
         return 2;
     }
     try {
-        // A control loop wants neither gradients nor threads nor compiling at its second call.
+        // A control loop needs no gradients, no threads and no compilation at its second call.
         const c10::InferenceMode inference;
         at::set_num_threads(1);
         torch::jit::setGraphExecutorOptimize(false);

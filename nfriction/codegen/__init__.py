@@ -1,6 +1,6 @@
 """Compiled code from torch modules: rollouts for scoring, functions for controllers.
 
-This package knows plants and friction only through the methods that it calls.
+This package uses plants and friction only through the methods that it calls.
 """
 
 from nfriction.codegen.function import CompiledFunction

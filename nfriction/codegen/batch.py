@@ -1,4 +1,4 @@
-"""Batches: arguments in the form that compiled code reads, and the code that loops over rows."""
+"""Batches: arguments in the form that compiled code reads, and code that loops over rows."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +20,7 @@ Array = np.ndarray
 AXES = ("row", "step", "element")
 # Rows computed together if all share their parameters.
 WIDTH = 8
-# Smallest number of rows for which this pays, since it costs another compilation.
+# Smallest number of rows for which this is worthwhile, since it needs another compilation.
 FEW = 3
 
 
@@ -28,9 +28,9 @@ FEW = 3
 class Series:
     """A quantity over rows, steps and elements; a stride of zero repeats one value."""
 
-    values: Array  # that the strides refer to
-    rows: int  # given, 1 where it is the same for all
-    strides: tuple[int, int, int]  # in numbers, along `AXES`
+    values: Array  # to which the strides refer
+    rows: int  # number given; 1 if the same for all
+    strides: tuple[int, int, int]  # in elements, along `AXES`
 
 
 def to_array(value: Any) -> Array:
@@ -41,7 +41,7 @@ def to_array(value: Any) -> Array:
 
 
 def series(name: str, value: Any, steps: int, width: tuple[int, ...]) -> Series:
-    """`value` of shape width, (steps, *width) or (candidate, steps, *width), not copied."""
+    """`value` of shape width, (steps, *width) or (candidate, steps, *width), without a copy."""
     array = to_array(value)
     full = (steps, *width)
     if array.shape == width:
@@ -83,9 +83,9 @@ def common_rows(rows: Mapping[str, int]) -> int:
 def parameter_rows(
     module: FunctionalModule, overrides: Mapping[str, Any]
 ) -> tuple[Array, dict[str, int]]:
-    """Parameter vectors, one row per candidate (or one for all), and the rows given by each name.
+    """Parameter vectors, one row per candidate (or one for all), and the number of rows by name.
 
-    Overrides have the parameter's shape or (candidate, *shape); other values are the module's.
+    Overrides have the parameter's shape or (candidate, *shape); other values come from the module.
     """
     unknown = [name for name in overrides if name not in module.shapes]
     if unknown:
@@ -110,9 +110,9 @@ def parameter_rows(
 class Layout:
     """Arguments of an entry point, in order."""
 
-    series: tuple[str, ...]  # inputs that have strides along `AXES`
+    series: tuple[str, ...]  # inputs with strides along `AXES`
     outputs: tuple[str, ...]  # arrays that are written
-    settings: tuple[str, ...] = ()  # further whole numbers
+    settings: tuple[str, ...] = ()  # further integers
 
     @property
     def addresses(self) -> tuple[str, ...]:
@@ -121,22 +121,22 @@ class Layout:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """Names of all whole numbers."""
+        """Names of all integers."""
         strides = (f"{name}_{axis}" for name in self.series for axis in AXES)
         return ("p_row", *self.settings, *strides)
 
 
 class Driver:
-    """Text of an entry point that processes rows `first` to `last`, some of them together.
+    """Text of an entry point that processes rows `first` to `last`, several at a time if possible.
 
-    Functions of the graph read and write arrays in the caller's workspace; every element has a slot
-    for each row that is computed together with others.
+    Functions of the graph read and write arrays in the caller's workspace; every element has one
+    slot for each of the rows that are computed together.
 
     Args:
         layout: its arguments.
-        width: rows computed together as vectors, which then share all parameters; 0 for one.
+        width: number of rows computed together as vectors, which share all parameters; 0 for one.
         sizes: elements of each array in the workspace.
-        once: values computed once, with one slot each.
+        once: number of values computed once, with one slot each.
     """
 
     def __init__(self, layout: Layout, width: int, sizes: Mapping[str, int], once: int) -> None:
@@ -155,7 +155,7 @@ class Driver:
 
     @contextmanager
     def entry(self) -> Iterator[None]:
-        """The function; within, `first` is the first of the rows that are computed together."""
+        """The function; in its body, `first` is the first of the rows computed together."""
         body = self.body
         arguments = "i64 %first, i64 %last, ptr %addresses, ptr %numbers, ptr %room"
         with body.function(f"define void @nf_entry({arguments})"):
@@ -177,11 +177,11 @@ class Driver:
             body.run("ret void")
 
     def element(self, name: str, index: int) -> str:
-        """Address of an element's places in the room."""
+        """Address of an element's slots in the workspace."""
         return self.body.at("%room", self.offset[name] + index * self.lanes)
 
     def call(self, name: str, *arguments: str) -> None:
-        """A function of addresses, by their names in `value`."""
+        """Call a function of addresses, given by their names in `value`."""
         given = ", ".join(f"ptr {self.value[a]}" for a in arguments)
         self.body.run(f"call void @{name}({given})")
 
@@ -191,7 +191,7 @@ class Driver:
 
     @contextmanager
     def each(self) -> Iterator[tuple[str, str]]:
-        """Rows that are computed together and their places; the last row fills up."""
+        """Rows that are computed together, and their slots; the last row fills spare slots."""
         if not self.width:
             yield self.value["first"], "0"
             return
@@ -200,7 +200,7 @@ class Driver:
             yield self.least(row, self.value["final"]), lane
 
     def gather(self, name: str, count: int, target: str, sample: str = "0") -> None:
-        """Read elements of a series into places from `target` on."""
+        """Read elements of a series into slots starting at `target`."""
         body = self.body
         ahead = body.let(f"mul i64 {sample}, {self.value[f'{name}_step']}")
         with self.each() as (row, lane):
@@ -211,7 +211,7 @@ class Driver:
                 body.store(body.load(source, index), target, self._place(i, lane))
 
     def scatter(self, name: str, count: int) -> None:
-        """Write an array of the room to each row's place in the output of its name."""
+        """Write a workspace array to the rows of the output with the same name."""
         body = self.body
         with self.each() as (row, lane):
             target = body.at(self.value[name], body.let(f"mul i64 {row}, {count}"))
@@ -228,7 +228,7 @@ class Kernel:
     """Compiled code over the rows of a batch.
 
     Args:
-        write: the driver of so many rows together, 0 for one at a time.
+        write: returns the driver for a number of rows computed together, 0 for one at a time.
         layout: its arguments.
     """
 
@@ -249,12 +249,12 @@ class Kernel:
         """Fill the outputs.
 
         Args:
-            rows: of the batch.
+            rows: number of rows in the batch.
             parameters: (row, value), or a single row for all.
-            given: series by name; one that is left out must not be read.
+            given: series by name; the code must not read one that is omitted.
             outputs: contiguous arrays to write to, by name.
-            settings: further numbers.
-            threads: number of threads that share the rows.
+            settings: further integers.
+            threads: number of threads among which the rows are divided.
         """
         own = len(parameters) > 1
         numbers = {"p_row": parameters.shape[1] if own else 0, **(settings or {})}
@@ -283,7 +283,7 @@ class Kernel:
                 job.result()
 
     def source(self, width: int = 0) -> str:
-        """LLVM IR for so many rows together, 0 for one at a time."""
+        """LLVM IR for a number of rows computed together, 0 for one at a time."""
         return self._write(width).body.text()
 
     def _function(self, width: int) -> tuple[Callable[..., None], int]:

@@ -1,7 +1,7 @@
 """Scalar nodes as LLVM IR, one number at a time or a vector of independent ones.
 
-Products are fused into sums here, depending only on the graph, and not by LLVM: so the same graph
-gives the same bits for a single candidate and in a batch.
+Products are fused into sums here, depending only on the graph, and not by LLVM, so the same graph
+gives bitwise identical results for a single candidate and in a batch.
 """
 
 from collections import Counter
@@ -33,13 +33,13 @@ def write_function(
     Args:
         body: the module.
         name: of the function.
-        outputs: nodes by the name of the array to which they are written.
+        outputs: nodes, by the name of the array to which they are written.
         places: array and index of each given node.
         shared: names of the arrays that never change and have one number per element.
         inputs: names of the other arrays that are read; an output may be one of them, because all
             of them are read before any is written.
-        width: numbers per element of these and of `outputs`, consecutive in memory; 0 for one.
-        seldom: it runs once per rollout, so short code matters more than speed.
+        width: numbers per element of `inputs` and `outputs`, consecutive in memory; 0 for one.
+        seldom: the function runs once per rollout, so short code matters more than speed.
     """
     given = [*shared, *dict.fromkeys([*inputs, *outputs])]
     heads = [f"ptr {'noalias readonly ' if a in shared else ''}%{a}" for a in given]
@@ -68,14 +68,14 @@ class _Writer:
         self.text: dict[int, str] = {}
         self.targets: dict[int, list[tuple[str, int]]] = {}
         self.results: dict[tuple[str, int], Sequence[str]] = {}  # by function and argument
-        self.fused: dict[int, int] = {}  # place of the product that a sum takes in, by node number
+        self.fused: dict[int, int] = {}  # position of the product fused into a sum, by node number
         self.absorbed: set[int] = set()
 
     def write(self, groups: Mapping[str, Sequence[Node]]) -> None:
-        """Compute outputs; what is not shared is loaded before anything is stored."""
+        """Compute outputs; arrays that are not shared are loaded before anything is stored."""
         outputs = [node for group in groups.values() for node in group]
         order = reachable(outputs, [n for n in reachable(outputs) if n.number in self.places])
-        # An output may be an input array, so a store could destroy what is still to be read.
+        # An output may be an input array, so a store could destroy values not yet read.
         for node in order:
             if node.number in self.places and self.places[node.number][0] not in self.shared:
                 self._value(node)
@@ -103,7 +103,7 @@ class _Writer:
         return found
 
     def _number(self, node: Node) -> str:
-        """The value as a number: true counts as one."""
+        """The value as a number: true is one."""
         text = self._value(node)
         if not is_predicate(node):
             return text
@@ -128,7 +128,7 @@ class _Writer:
         return self.body.let(f"shufflevector {kind} {first}, {kind} poison, {every}")
 
     def _fuse(self, order: Sequence[Node], outputs: Sequence[Node]) -> None:
-        """Find products that only a single sum reads."""
+        """Find products that are used only by one sum."""
         computed = [n for n in order if n.number not in self.places]
         uses = Counter(a.number for n in computed for a in n.args)
         uses.update(n.number for n in outputs)
@@ -144,7 +144,7 @@ class _Writer:
                     break
 
     def _phases(self, order: Sequence[Node]) -> None:
-        """Write all nodes; calls that are independent of each other share vectors."""
+        """Write all nodes; mutually independent calls share vectors."""
         phase: dict[int, int] = {}
         for node in order:
             before = [] if node.number in self.places else node.args
@@ -228,7 +228,7 @@ class _Writer:
         return body.each(op, [f"{kind} {x}" for x in operands], self.width)
 
     def _sum_of_product(self, node: Node) -> str:
-        """A product and a sum with one rounding."""
+        """A product and a sum with a single rounding (fused multiply-add)."""
         place = self.fused[node.number]
         a, b = (self._number(f) for f in node.args[place].args)
         other = self._number(node.args[1 - place])
@@ -241,7 +241,7 @@ class _Writer:
         return self.body.call("fmuladd", [a, b, other], self.width)
 
     def _extreme(self, sign: str, a: str, b: str) -> str:
-        """The larger or smaller; NaN stays."""
+        """The larger or smaller value; NaN is propagated."""
         kind, test = real(self.width), truth(self.width)
         first = self.body.let(f"fcmp {sign} {kind} {a}, {b}")
         missing = self.body.let(f"fcmp uno {kind} {a}, {a}")

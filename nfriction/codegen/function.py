@@ -24,25 +24,25 @@ from nfriction.codegen.scalar import SelfCheckFailed
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
-# Kernels cached by their computation, with the shapes of their outputs: fits to parts of the data,
-# or from several starts, share them. Six laws have twelve, of about ten megabytes each.
+# Number of kernels cached by their computation, with the shapes of their outputs: fits to parts of
+# the data or from several starts share them. Six laws need twelve, of about ten megabytes each.
 _KEPT = 16
 _known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 
 class CompiledFunction:
-    """A compiled function of tensors, on NumPy arrays whose first axis is a batch.
+    """A compiled function of tensors, applied to NumPy arrays whose first axis is a batch.
 
     Args:
-        function: a module, a bound method of one (its parameters stay inputs, read at every
-            call), or any callable (tensors it closes over are baked in).
+        function: a module or a bound method of one (whose parameters remain inputs, read at every
+            call), or any callable (tensors in its closure become constants).
         example_inputs: float64 tensors of the right shapes, without a batch dimension.
-        jacobian: indices of the inputs in which to differentiate; the exact Jacobian, (elements of
+        jacobian: indices of the inputs by which to differentiate; the exact Jacobian, (elements of
             all outputs, elements of these inputs), is then returned last.
 
     Raises:
-        UnsupportedOperation: it uses an operation that has no scalar form here.
-        SelfCheckFailed: compiled values differ from eager ones.
+        UnsupportedOperation: if it uses an operation that has no scalar form here.
+        SelfCheckFailed: if compiled values differ from eager ones.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class CompiledFunction:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         generator = torch.Generator().manual_seed(0)
-        # The examples themselves may lie at a kink, where derivatives of both sides are correct.
+        # The examples themselves may lie at a kink, where either one-sided derivative is correct.
         # Relative to the examples, because functions may grow without bound where signs change.
         for spread in (0.1,) if self._jacobian else (0.0, 0.01, 0.1):
             inputs = [
@@ -119,7 +119,7 @@ class CompiledFunction:
             ]
             with torch.no_grad():
                 eager = self._eager([x.to(self._module.device) for x in inputs])
-            # As many rows as in most calls, so that their code is checked.
+            # Enough rows for the vector code, which most calls use.
             ours = self(*(x.expand(FEW, *x.shape) for x in inputs))
             for a, b in zip(
                 ours if isinstance(ours, tuple) else (ours,),
@@ -135,7 +135,7 @@ class CompiledFunction:
                     )
 
     def _eager(self, inputs: list[Tensor]) -> tuple[Tensor, ...]:
-        """All outputs, the Jacobian among them, in eager torch."""
+        """All outputs, including the Jacobian, in eager torch."""
 
         def outputs(*given: Tensor) -> Tensor:
             return torch.cat([y.reshape(-1) for y in _tuple(self._function(*given))])
@@ -143,7 +143,7 @@ class CompiledFunction:
         eager = _tuple(self._function(*inputs))
         if not self._jacobian:
             return eager
-        # By plain autograd: `torch.func` imports the whole of torch._dynamo (2 s).
+        # With plain autograd: `torch.func` imports all of torch._dynamo (2 s).
         blocks = torch.autograd.functional.jacobian(outputs, tuple(inputs))
         flat = [blocks[i].reshape(len(blocks[i]), -1) for i in self._jacobian]
         return (*eager, torch.cat(flat, -1))

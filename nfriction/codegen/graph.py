@@ -3,9 +3,9 @@
 The function runs once on `ScalarTensor`s: tensors with an array of scalar nodes in addition to an
 example value. Every ATen operation that reaches the dispatcher (composite ones arrive already
 decomposed) acts on both, so views cost nothing, in-place writes are visible through views, two
-equal tensors remain two inputs, and shapes and dtypes are torch's own. If Python asks for a value
-(`if x > 0`, `.item()`), the trace stops with an error instead of baking in one branch. Tracing
-takes milliseconds, `torch.export` takes seconds.
+equal tensors remain two inputs, and shapes and dtypes are those of torch. If Python needs a value
+(`if x > 0`, `.item()`), the trace stops with an error instead of hard-coding one branch. Tracing
+takes milliseconds; `torch.export` takes seconds.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from nfriction.codegen.operations import OPERATIONS, constants
 from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, UpdateRate, reachable
 
-# Limit on elements of a traced tensor, and on scalar operations of a traced function.
+# Limit on the elements of a traced tensor and on the scalar operations of a traced function.
 LIMIT = 50_000
 
 
@@ -85,7 +85,7 @@ class ScalarTensor(Tensor):
 
 
 class _Rules:
-    """Rules of tracing: nothing is random, and freshly created tensors are traceable."""
+    """Rules of tracing: nothing is random, and newly created tensors are traceable."""
 
     graph: Graph
 
@@ -108,8 +108,8 @@ class _Rules:
 
 
 class _Watch(_Rules, TorchDispatchMode):
-    # torch wraps a `__torch_dispatch__` found in the mode's own class so that it imports the whole
-    # of torch._dynamo (2 s) on first use; an inherited one it leaves alone.
+    # torch wraps a `__torch_dispatch__` defined in the mode's own class so that its first use
+    # imports all of torch._dynamo (2 s); it leaves an inherited one alone.
     def __init__(self, graph: Graph) -> None:
         super().__init__()
         self.graph = graph
@@ -129,7 +129,7 @@ def _interpret(
         return _concrete(leaves[0], name)
     operation = OPERATIONS.get(name.removesuffix("_") if in_place else name)
     if operation is None or (in_place and not isinstance(args[0], ScalarTensor)):
-        with watch:  # inside its own handler a mode is off
+        with watch:  # a mode is off inside its own handler
             return _decomposed(func, name, args, kwargs)
 
     def nodes_of(leaf: Any) -> Any:
@@ -155,7 +155,7 @@ def _interpret(
 
 
 def _each(function: Callable[[Any], Any], value: Any) -> Any:
-    """Map a function over nested lists; torch's own `tree_map` takes half the time of a trace."""
+    """Map over nested lists; torch's `tree_map` would take half of a trace's time."""
     if isinstance(value, (list, tuple)):
         return [_each(function, x) for x in value]
     return function(value)
@@ -184,7 +184,7 @@ def _write(target: ScalarTensor, nodes: np.ndarray, name: str) -> ScalarTensor:
 def _reshape_in_place(
     target: ScalarTensor, nodes: np.ndarray, func: Any, args: Any, kwargs: Any
 ) -> ScalarTensor:
-    """`squeeze_` and similar (torch's own `linear` uses it) only change shape and strides."""
+    """`squeeze_` and similar (used by torch's `linear`), which only change shape and strides."""
     included = torch._C._meta_in_tls_dispatch_include()
     torch._C._set_meta_in_tls_dispatch_include(True)
     try:
@@ -235,7 +235,7 @@ def trace(
             raise ValueError(
                 f"`{name}` must be float64, got {example.dtype}; call `.double()` on the module."
             )
-        # Copies, so that inputs never share memory.
+        # Copy, so that inputs never share memory.
         example = example.detach().to("cpu").clone(memory_format=torch.contiguous_format)
         rate = UpdateRate.PARAMETER if name in parameters else UpdateRate.STEP
         nodes = [graph.input(name, i, rate) for i in range(example.numel())]
@@ -260,7 +260,7 @@ def _output(graph: Graph, index: int, output: Any) -> Port:
 class FunctionalModule:
     """A module whose floating-point parameters and buffers are inputs named p0, p1, ...
 
-    Integer and boolean buffers stay constants: they index and select, so they must be known when
+    Integer and boolean buffers remain constants: they index and select, so they must be known when
     code is emitted.
 
     Args:
@@ -285,13 +285,13 @@ class FunctionalModule:
         return next((t.device for t in self._state().values()), torch.device("cpu"))
 
     def value(self, name: str) -> Tensor:
-        """The present value of a parameter or buffer."""
+        """The current value of a parameter or buffer."""
         owner, _, last = name.rpartition(".")
         value: Tensor = getattr(self.module.get_submodule(owner), last)
         return value
 
     def trace(self, inputs: Mapping[str, Tensor]) -> Program:
-        """Trace `module(**inputs)` with examples; the program's first inputs are the parameters."""
+        """Trace `module(**inputs)` with examples; the first inputs of the result are parameters."""
         state = self._state()
         parameters = {f"p{i}": state[name] for i, name in enumerate(self.shapes)}
 
@@ -306,7 +306,7 @@ class Method(nn.Module):
     """A module, a bound method of one, or any callable, with named arguments.
 
     Args:
-        function: what to call; its arguments are passed by position in the order given.
+        function: the callable; its arguments are passed by position in the given order.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -1,9 +1,9 @@
-"""LLVM IR as text, function by function, with exp, tanh, sin and cos of whole vectors.
+"""LLVM IR as text, function by function, with exp, tanh, sin and cos of vectors.
 
-These four take most of a rollout's time, and the C library computes them one number at a time. Here
-polynomials are evaluated by Estrin's scheme, whose short chains of dependent operations suit a step
-that waits for each of its stages. Errors stay below 3 units in the last place; NaN and infinity
-behave as in the library; sin and cos of arguments beyond 1e5 are the library's.
+These four take most of the time of a rollout, and the C library computes them one number at a time.
+Here polynomials are evaluated by Estrin's scheme, whose short chains of dependent operations suit
+a step whose stages are sequential. Errors are below 3 units in the last place; NaN and infinity
+behave as in the library; sin and cos of arguments beyond 1e5 come from the library.
 
 References:
     Argument reduction by a constant in several exact parts: W. J. Cody and W. Waite, Software
@@ -20,7 +20,7 @@ _EXP_SERIES = [1.0 / factorial(k) for k in range(2, 14)]
 _SIN_SERIES = [(-1.0) ** k / factorial(2 * k + 1) for k in range(1, 9)]
 _COS_SERIES = [(-1.0) ** k / factorial(2 * k) for k in range(2, 9)]
 
-# Adding 1.5 * 2^52 rounds to an integer, which is then in the lowest bits.
+# Adding 1.5 * 2^52 rounds to an integer, which then occupies the lowest bits.
 _ROUND = 6755399441055744.0
 
 
@@ -33,7 +33,7 @@ def truth(width: int) -> str:
 
 
 class Body:
-    """Text of a module, written function by function."""
+    """Text of an LLVM module, written function by function."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -61,7 +61,7 @@ class Body:
         return f"{stem}{self._count}"
 
     def let(self, text: str) -> str:
-        """A new value."""
+        """Define a new value."""
         name = f"%{self.fresh()}"
         self.lines.append(f"  {name} = {text}")
         return name
@@ -89,7 +89,7 @@ class Body:
         self.run(f"{following} = add nsw i64 {index}, 1")
         self.run(f"br label %{head}")
         phi = f"phi i64 [ {first}, %{before} ], [ {following}, %{self.label} ]"
-        # Written last, as the label that the loop comes back from is known only now.
+        # Written last, because the label from which the loop returns is known only now.
         self.lines[place] = f"  {index} = {phi}"
         self.block(after)
 
@@ -113,7 +113,7 @@ class Body:
         self.run(f"store {kind} {value}, ptr {self.at(pointer, index, kind)}, align 8")
 
     def constant(self, value: float | bool, width: int = 0) -> str:
-        """A literal, repeated where a vector of some width is wanted."""
+        """A literal, repeated if a vector of some width is needed."""
         if isinstance(value, bool):
             kind, text = "i1", "true" if value else "false"
         else:
@@ -122,19 +122,19 @@ class Body:
         return f"<{', '.join([f'{kind} {text}'] * width)}>" if width else text
 
     def call(self, name: str, operands: Sequence[str], width: int = 0) -> str:
-        """A function that LLVM has for vectors too."""
+        """Call an LLVM intrinsic, which also exists for vectors."""
         kind = real(width)
         full = f"llvm.{name}.{f'v{width}f64' if width else 'f64'}"
         self._declare(kind, full, len(operands))
         return self.let(f"call {kind} @{full}({', '.join(f'{kind} {x}' for x in operands)})")
 
     def each(self, op: str, operands: Sequence[str], width: int) -> str:
-        """A function of the C library, called for every element; operands with their types."""
+        """Call a function of the C library for every element; operands include their types."""
         self._declare("double", op, len(operands))
         if not width:
             return self.let(f"call double @{op}({', '.join(operands)})")
         found = "poison"
-        # Vectors are taken apart where the C library has only the scalar function.
+        # Vectors are split, because the C library has only the scalar function.
         for i in range(width):
             parts = [self.let(f"extractelement {x}, i64 {i}") for x in operands]
             one = self.let(f"call double @{op}({', '.join(f'double {x}' for x in parts)})")
@@ -146,7 +146,7 @@ class Body:
         self.declared[name] = f"{text} nounwind"
 
     def family(self, name: str, x: str, width: int) -> tuple[str, ...]:
-        """One of the functions of whole vectors; sines and cosines come together."""
+        """Call one of the vector functions; sine and cosine are computed together."""
         if name == "sincos":
             self._widths.add(width)
             return _sincos(_Vectors(self, width), x)
@@ -154,7 +154,7 @@ class Body:
 
 
 class _Vectors:
-    """Arithmetic on vectors of one width; numbers are repeated."""
+    """Arithmetic on vectors of one width; scalars are repeated."""
 
     def __init__(self, body: Body, width: int) -> None:
         self.body = body
@@ -193,7 +193,7 @@ class _Vectors:
         return self.body.let(f"{op} {self.bits} {a}, {b}")
 
     def polynomial(self, x: str, coefficients: Sequence[float]) -> str:
-        """Estrin's scheme; coefficients of rising powers."""
+        """Evaluate by Estrin's scheme; coefficients in order of ascending power."""
         terms: list[str | float] = list(coefficients)
         power = x
         while len(terms) > 1:
@@ -205,7 +205,7 @@ class _Vectors:
 
 
 def _exp(v: _Vectors, x: str) -> str:
-    # NaN compares false and so stays.
+    # NaN compares false and is therefore propagated.
     x = v.where(x, "ogt", 709.5, 709.5, v.where(x, "olt", -708.0, -708.0, x))
     fraction, power = _halving(v, x)
     return v.mul(v.add(fraction, 1.0), power)
@@ -246,7 +246,7 @@ def _sincos(v: _Vectors, x: str) -> tuple[str, str]:
 
 
 def _far_sincos(body: Body, width: int) -> None:
-    """A function of the library's sines and cosines, seldom called."""
+    """Write a rarely called function for the library's sines and cosines."""
     real = f"<{width} x double>"
     pair = f"{{ {real}, {real} }}"
     with body.function(f"define internal {pair} @nf_far{width}({real} %x) noinline cold"):
@@ -258,7 +258,7 @@ def _far_sincos(body: Body, width: int) -> None:
 
 
 def _halving(v: _Vectors, x: str) -> tuple[str, str]:
-    """exp(x) as 1 + fraction times a power of two."""
+    """exp(x) as (1 + fraction) times a power of two."""
     t = v.mul_add(x, 1.4426950408889634, _ROUND)
     n = v.sub(t, _ROUND)
     r = v.mul_add(n, -1.9082149292705877e-10, v.mul_add(n, -0.6931471803691238, x))

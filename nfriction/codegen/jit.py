@@ -1,8 +1,8 @@
-"""Machine code of LLVM IR, kept in a private folder of the user's.
+"""Machine code from LLVM IR, cached in a private folder of the user.
 
-Object code is kept under the hash of the IR, LLVM's effort and version, and the processor, so an
-unchanged model is compiled once per machine. Where the folder cannot be used, code is compiled in
-memory.
+Object code is cached by a hash of the IR, LLVM's optimisation level and version, and the processor,
+so an unchanged model is compiled once per machine. If the folder cannot be used, code is compiled
+in memory.
 """
 
 import ctypes
@@ -20,10 +20,10 @@ from typing import Any
 logger = logging.getLogger(__name__)
 
 _KEPT = ".object"
-# Effort of LLVM, 0 to 3: 2 takes a fifth longer to compile code that is no faster; 0 takes a third
-# of the time, and fits take three times as long.
+# LLVM's optimisation level, 0 to 3: with 2, compilation takes a fifth longer and code is no faster;
+# with 0, it takes a third of the time, but fits take three times as long.
 EFFORT = 1
-# Functions of the C library that emitted code calls.
+# C library functions called by emitted code.
 LIBRARY = (
     *("exp", "expm1", "log", "log1p", "pow", "fmod", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("atan2", "sinh", "cosh", "tanh"),
@@ -34,7 +34,7 @@ def cache_folder() -> Path:
     """The private folder for compiled models; `NFRICTION_CACHE` overrides the platform's choice.
 
     Raises:
-        PermissionError: if the folder belongs to somebody else or others may write to it.
+        PermissionError: if the folder belongs to another user or others may write to it.
     """
     given = os.environ.get("NFRICTION_CACHE")
     folder = Path(given) if given else _user_cache() / "nfriction"
@@ -58,9 +58,9 @@ def _user_cache() -> Path:
 
 
 def build(source: str, name: str) -> Callable[..., None]:
-    """A function of a module of LLVM IR, which lets go of the GIL.
+    """Compile a function of an LLVM IR module; it releases the GIL.
 
-    It takes two whole numbers and three addresses, as `Driver.entry` writes it.
+    It takes two integers and three addresses, as written by `Driver.entry`.
 
     Args:
         source: the module.
@@ -73,7 +73,7 @@ def build(source: str, name: str) -> Callable[..., None]:
     folder = None
     try:
         folder = cache_folder()
-    except (OSError, RuntimeError) as error:  # a RuntimeError where there is no home folder
+    except (OSError, RuntimeError) as error:  # RuntimeError if there is no home folder
         _warn_not_kept(str(error))
     code = _kept(folder, key) if folder else None
     if code is None:
@@ -81,7 +81,7 @@ def build(source: str, name: str) -> Callable[..., None]:
         if folder:
             _keep(folder, key, code)
     _find_library(llvm)
-    # The engine also owns the target machine, so each has its own.
+    # The engine also owns the target machine, so each engine has its own.
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -95,7 +95,7 @@ def build(source: str, name: str) -> Callable[..., None]:
 
 
 def _find_library(llvm: Any) -> None:
-    """Name functions that LLVM does not find on Windows, where a missing one ends the process."""
+    """Register functions that LLVM does not find on Windows; a missing one ends the process."""
     if sys.platform == "win32":
         for library, names in (("ucrtbase", LIBRARY), ("ntdll", ("__chkstk",))):
             for name in names:
@@ -112,7 +112,7 @@ def _warn_not_kept(reason: str) -> None:
 
 
 def _kept(folder: Path, key: str) -> bytes | None:
-    """Object code whose contents still have the digest that its name has."""
+    """Object code whose contents match the digest in its file name."""
     for path in sorted(folder.glob(f"{key}-*{_KEPT}")):
         try:
             code = path.read_bytes()
@@ -124,7 +124,7 @@ def _kept(folder: Path, key: str) -> bytes | None:
 
 
 def _keep(folder: Path, key: str, code: bytes) -> None:
-    """Write object code. The rename is atomic: others see the whole or nothing."""
+    """Write object code. The rename is atomic: other processes see the whole file or none."""
     draft = None
     try:
         handle, draft = tempfile.mkstemp(dir=folder, prefix="building-")
@@ -150,7 +150,7 @@ def _version() -> str:
 
 @cache
 def _processor() -> tuple[str, str]:
-    """Name and features of this processor: a cache shared by machines must keep them apart."""
+    """Name and features of this processor, which a cache shared by machines must distinguish."""
     from llvmlite import binding as llvm
 
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
@@ -176,6 +176,6 @@ def _compile(source: str) -> bytes:
     module.triple = machine.triple
     module.data_layout = str(machine.target_data)
     module.verify()
-    # The graph is simplified and its values are shared, so LLVM's own passes, which take as long as
-    # everything else, gain nothing.
+    # The graph is already simplified and its values are shared, so LLVM's own passes, which take as
+    # long as everything else, gain nothing.
     return bytes(machine.emit_object(module))

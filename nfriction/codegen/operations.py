@@ -1,7 +1,7 @@
 """ATen operations on arrays of scalar nodes: pointwise ones, reductions, products and views.
 
-Every function takes the graph and then the operation's own arguments in their order, with tensors
-replaced by object arrays of nodes, and returns such an array (views really are views).
+Every function takes the graph and then the arguments of the operation in order, with tensors
+replaced by object arrays of nodes, and returns an array of nodes (views really are views).
 """
 
 import math
@@ -16,12 +16,12 @@ from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, is_predi
 Nodes = np.ndarray
 Operation = Callable[..., Any]
 
-# By the ATen name without `aten::` and overload; in-place forms map to their base name.
+# Keys are ATen names without `aten::` and overload; in-place forms map to their base name.
 OPERATIONS: dict[str, Operation] = {}
 
 
 def supported_operations() -> list[str]:
-    """Names of the ATen operations that can be compiled (others are decomposed where known)."""
+    """Names of the ATen operations that can be compiled (others are decomposed if possible)."""
     return sorted(OPERATIONS)
 
 
@@ -53,7 +53,7 @@ def as_nodes(g: Graph, x: Any) -> Nodes:
 
 
 def elementwise(g: Graph, function: Callable[..., Node], *operands: Any) -> Nodes:
-    """`function` of corresponding elements, operands broadcast."""
+    """`function` of corresponding elements, with operands broadcast."""
     arrays = np.broadcast_arrays(*(as_nodes(g, x) for x in operands))
     out = np.empty(arrays[0].size, dtype=object)
     out[:] = [function(*xs) for xs in zip(*(a.flat for a in arrays), strict=True)]
@@ -68,12 +68,12 @@ def number(g: Graph, node: Node) -> Node:
 
 
 def predicate(g: Graph, node: Node) -> Node:
-    """`node` as a truth value: everything but zero is true."""
+    """`node` as a truth value: everything except zero is true."""
     return node if is_predicate(node) else g.apply("ne", node, g.constant(0.0))
 
 
 def numbers(g: Graph, op: str, *operands: Any) -> Nodes:
-    """The scalar operation `op` on corresponding elements, truth values taken as numbers."""
+    """The scalar operation `op` on corresponding elements, with truth values as numbers."""
     return elementwise(g, lambda *xs: g.apply(op, *(number(g, x) for x in xs)), *operands)
 
 
@@ -288,7 +288,7 @@ def _index_put(
     return out
 
 
-# All that is one expression.
+# All operations that need only one expression.
 OPERATIONS |= {
     "full_like": lambda g, a, value, **_: _full(g, a, None, value),
     "ge": lambda g, a, b: numbers(g, "le", b, a),
@@ -326,13 +326,13 @@ OPERATIONS |= {
             elementwise(g, lambda x: number(g, x), source), a.shape
         ),
     ),
-    # Memory that torch leaves uninitialised is zero, so that a trace does not depend on chance.
+    # Memory that torch leaves uninitialised is set to zero, so that a trace is deterministic.
     **dict.fromkeys(
         ("zero", "zeros_like", "new_zeros", "empty_like", "new_empty"),
         lambda g, a, size=None, **_: _full(g, a, size, 0.0),
     ),
     **dict.fromkeys(("ones_like", "new_ones"), lambda g, a, size=None, **_: _full(g, a, size, 1.0)),
-    # torch ignores the historic empty 1-D tensor.
+    # torch ignores the legacy empty 1-D tensor.
     "cat": lambda g, tensors, dim=0: np.concatenate(
         [t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim
     ),

@@ -1,4 +1,4 @@
-"""Rollouts of a plant with friction: what is traced of them, the loops around it, many at once."""
+"""Rollouts of a plant with friction: the traced step, the loops around it, and batches."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,16 +30,16 @@ LAYOUT = Layout(
     outputs=("q_out", "qd_out", "qdd_out", "diverged", "law_out"),
     settings=("samples", "substeps", "driven", "remembered"),
 )
-# A joint faster than this [rad/s or m/s] has left any mechanism's range: it has diverged.
+# A joint faster than this [rad/s or m/s] is beyond the range of any mechanism: it has diverged.
 SPEED_LIMIT = 1e6
-# Of `ForcedSystem`; all other inputs of its trace are parameters.
+# Inputs of `ForcedSystem`; all other inputs of its trace are parameters.
 INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory", "law")
 
 
 class ForcedSystem(nn.Module):
-    """Plant and friction as the one function that a rollout repeats, see `CompiledRollout`.
+    """Plant and friction as the single function that a rollout repeats, see `CompiledRollout`.
 
-    Of a friction law with memory its state is a last argument of `step`, and the state afterwards a
+    For a friction law with memory, its state is the last argument of `step`, and its new state the
     last result.
     """
 
@@ -78,25 +78,25 @@ class RolloutProgram:
     """The functions of a rollout as groups of nodes."""
 
     joints: int
-    once: tuple[Node, ...]  # computed once a rollout
-    start: tuple[Node, ...]  # acceleration without friction, the one known at the start
-    held: tuple[Node, ...]  # coefficients of a motion, and of a memory where they have one
+    once: tuple[Node, ...]  # computed once per rollout
+    start: tuple[Node, ...]  # acceleration without friction, known at the start
+    held: tuple[Node, ...]  # coefficients at a motion and, if they have one, a hidden state
     step: tuple[Node, ...]  # q, qd, qdd after a step, and the state of a law with memory
-    within: Node  # whether that state is finite and no joint too fast
-    begin: tuple[Node, ...]  # memory of the coefficients after the first sample, if any
-    advance: tuple[Node, ...]  # that after a sample, from that before
+    within: Node  # true if that state is finite and no joint is too fast
+    begin: tuple[Node, ...]  # hidden state of the coefficients after the first sample, if any
+    advance: tuple[Node, ...]  # hidden state after a sample, from the previous one
     places: dict[int, tuple[str, int]]  # array and index of the input nodes
 
 
 def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
-    """Arrange the trace of a `ForcedSystem` whose law has an internal state of that size."""
+    """Arrange the trace of a `ForcedSystem` whose law has an internal state of size `law_size`."""
     graph, outputs = program.graph, [port.nodes for port in program.outputs]
     law = outputs.pop(3) if law_size else ()
     q, qd, qdd, start, held, *remembered = outputs
     begin, advance = remembered or ((), ())
     joints = len(q)
     zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
-    # A number minus itself is zero unless it is NaN or infinite, which compares false.
+    # x - x is zero unless x is NaN or infinite, in which case the comparison is false.
     tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
     tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
     within = graph.total(tests, "and")
@@ -116,7 +116,7 @@ def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
 
 
 class RolloutDriver(Driver):
-    """The loops over candidates, samples and substeps in which a program's functions are called."""
+    """The loops over candidates, samples and substeps that call the functions of a program."""
 
     def __init__(self, program: RolloutProgram, width: int) -> None:
         n = program.joints
@@ -149,7 +149,7 @@ class RolloutDriver(Driver):
         function("nf_step", ["state", "tau", "step", "held"], after)
 
     def _candidates(self) -> None:
-        """The candidates that are computed together."""
+        """Write the code for candidates that are computed together."""
         body, n, value = self.body, self.program.joints, self.value
         self.call("nf_once", "own_p", "room.once")
         self.gather("q0", n, value["room.state"])
@@ -185,7 +185,7 @@ class RolloutDriver(Driver):
         value["sees"] = body.let(f"select i1 {driven}, {given}")
         if self.program.advance:
             self._remember(k)
-            # A controller at the sample rate holds its coefficients over the whole sample.
+            # A controller running at the sample rate holds its coefficients over the whole sample.
             self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
         with body.loop("0", value["substeps"]):
             if not self.program.advance:
@@ -215,7 +215,7 @@ class RolloutDriver(Driver):
             self.call("nf_begin", "own_p", "room.once", "sees", "room.memory")
 
     def _stop(self, k: str, alive: str) -> None:
-        """Note which candidates are lost; their state goes on from zero, unseen."""
+        """Mark candidates that diverged; their simulation continues from zero, without output."""
         body = self.body
         reached = body.let(f"add i64 {k}, 1")
         with self.each() as (candidate, lane):
@@ -231,7 +231,7 @@ class RolloutDriver(Driver):
                     body.run(f"store i64 {left}, ptr {alive}")
 
     def _record(self, sample: str) -> None:
-        """Write states; NaN of candidates that are lost."""
+        """Write states; NaN for candidates that diverged."""
         body, n = self.body, self.program.joints
         records = body.let(f"add i64 {self.value['samples']}, 1")
         with self.each() as (candidate, lane):
@@ -251,7 +251,7 @@ class RolloutDriver(Driver):
                     element += 1
 
 
-# Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
+# For accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
 
 
@@ -263,13 +263,13 @@ class RolloutInputs:
         q0, qd0: initial state [rad, rad/s], (*batch, joint).
         tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
         step: sample times [s], (steps,) or (*batch, steps).
-        substeps: integration steps to each sample.
-        measured: velocity and acceleration that drive the coefficients in place of the simulated
+        substeps: integration steps per sample.
+        measured: velocity and acceleration that drive the coefficients instead of the simulated
             ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
         hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
-            None for that of the first sample alone.
-        law_state: internal state of the friction law at the start, (*batch, joint, state); None of
-            a law without.
+            None to compute it from the first sample.
+        law_state: internal state of the friction law at the start, (*batch, joint, state); None
+            for a law without memory.
     """
 
     q0: Tensor
@@ -283,27 +283,27 @@ class RolloutInputs:
 
 
 class CompiledRollout:
-    """Rollouts of a plant with friction, traced at once and compiled at the first call.
+    """Rollouts of a plant with friction, traced on creation and compiled at the first call.
 
-    Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
-    change them, and may differ from candidate to candidate. Everything else (Python numbers,
-    integer and boolean buffers, the modules' structure) is baked in.
+    Parameters and floating-point buffers remain inputs: they are read at every call, so a fit can
+    change them, and they may differ between candidates. Everything else (Python numbers, integer
+    and boolean buffers, the modules' structure) becomes constant.
 
     Args:
         plant: module with `joints`, `forward_dynamics` and `load`.
-        friction: module with `coefficients` and `torque`; one whose coefficients have a memory
-            also has `state_size` > 0, `initial_state`, `advance` and `coefficients_from`.
-        step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`, which is
-            repeated; for instance `nfriction.simulation.rk4.rk4_step`.
+        friction: module with `coefficients` and `torque`; if its coefficients have a hidden state,
+            also with `state_size` > 0, `initial_state`, `advance` and `coefficients_from`.
+        step: the function to repeat, `(plant, friction, q, qd, tau, coefficients, step) ->
+            (q, qd, qdd)`; for instance `nfriction.simulation.rk4.rk4_step`.
 
     Attributes:
         parameter_names: names under which `parameters` may be given.
-        digest: a hash of all that is computed; code of another plant and friction model with the
-            same digest computes the same, given the same parameters.
+        digest: a hash of the whole computation; code for another plant and friction model with
+            the same digest gives the same results for the same parameters.
 
     Raises:
-        UnsupportedOperation: the modules use an operation that has no scalar form here.
-        TypeError: one of them is no module.
+        UnsupportedOperation: if the modules use an operation that has no scalar form here.
+        TypeError: if one of them is not a module.
     """
 
     def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
@@ -320,7 +320,7 @@ class CompiledRollout:
 
     @cached_property
     def kernel(self) -> Kernel:
-        """The compiled code, emitted at its first use."""
+        """The compiled code, emitted on first use."""
         program = arrange(self._traced, self._system.law_size)
         return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
 
@@ -348,19 +348,19 @@ class CompiledRollout:
         parameters: Mapping[str, Tensor] | None = None,
         threads: int = 1,
     ) -> tuple[Tensor, ...]:
-        """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
+        """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and the law's state.
 
-        They are NaN from the sample on at which a state is not finite or too fast. The
-        acceleration is that of the first stage of the step before, at the start without friction.
+        They are NaN from the first sample whose state is not finite or too fast. The acceleration
+        is that of the first stage of the preceding step; at the start, that without friction.
 
         Args:
-            inputs: initial states, sample times, and all that drives the motion.
+            inputs: initial states, sample times, and everything that drives the motion.
             parameters: values that differ from the modules', by name ("plant.…", "friction.…"),
                 shape (batch, *the parameter's own) or just the parameter's own.
-            threads: the batch is shared out among this many.
+            threads: number of threads among which the batch is divided.
 
         Raises:
-            ValueError: for shapes that do not fit, or a name that is not there.
+            ValueError: for shapes that do not match, or an unknown name.
         """
         steps, substeps, n = inputs.step.shape[-1], inputs.substeps, self.joints
         if substeps < 1 or threads < 1:
@@ -370,12 +370,12 @@ class CompiledRollout:
         batch = inputs.q0.shape[:-1]
 
         def rows(x: Tensor, trailing: int) -> Tensor:
-            """Candidates on one leading axis; what all share keeps none."""
+            """Candidates on one leading axis; values shared by all have no such axis."""
             x = x.detach()
             own = x.shape[x.ndim - trailing :]
             if x.ndim > trailing:
                 x = x.expand(*batch, *own).reshape(-1, *own)
-            # An expanded constant needs no value for each step.
+            # An expanded constant does not need one value per step.
             return x[0] if x.ndim == trailing and not x.stride(0) else x
 
         given = {
@@ -412,10 +412,10 @@ class CompiledRollout:
         Raises:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
-        # Two steps, so that a memory advances once; short ones, so that errors show in the rate.
+        # Two steps, so that a hidden state advances once; short, so that errors show in the rate.
         steps, dt = 2, 1e-4
         generator = torch.Generator().manual_seed(1)
-        scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, as mechanisms move
+        scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, typical of mechanisms
         for _ in range(3):
             tau, q, qd = (
                 s * torch.randn(self.joints, generator=generator, dtype=torch.float64)
@@ -435,7 +435,7 @@ class CompiledRollout:
 
     @torch.no_grad()
     def _eager(self, q: Tensor, qd: Tensor, tau: Tensor, steps: int, dt: float) -> Tensor:
-        """Velocity after some steps in torch."""
+        """Velocity after a number of steps in torch."""
         q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
         plant, friction = self._system.plant, self._system.friction
         qdd, memory = plant.forward_dynamics(q, qd, tau), None

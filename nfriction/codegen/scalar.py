@@ -1,7 +1,7 @@
 """A graph of scalar operations that simplifies itself while it is built.
 
 Nodes are hash-consed: the same operation on the same arguments is the same node, so common
-subexpressions never arise. Each node has an `UpdateRate`, that of its most volatile argument.
+subexpressions never arise. Each node has an `UpdateRate`: that of its most volatile argument.
 """
 
 import math
@@ -13,13 +13,13 @@ import numpy as np
 
 
 class CodegenError(RuntimeError):
-    """Base of everything the code generator raises on purpose."""
+    """Base of all errors that the code generator raises on purpose."""
 
 
 class UnsupportedOperation(CodegenError):  # noqa: N818
     """A traced module uses an operation that has no scalar form here.
 
-    The torch rollout runs every module; only the compiled one needs this list.
+    The torch rollout runs every module; only the compiled one has this limitation.
     """
 
     def __init__(self, operation: str, reason: str = "has no scalar form here") -> None:
@@ -36,11 +36,11 @@ class SelfCheckFailed(CodegenError):  # noqa: N818
 
 
 class Incomparable(CodegenError):  # noqa: N818
-    """Something that a trace may read cannot be compared with what it was before."""
+    """Something that a trace may read cannot be compared with its previous value."""
 
 
 class UpdateRate(IntEnum):
-    """Frequency at which a value has to be computed; the lower, the more seldom."""
+    """Frequency at which a value has to be computed; lower values mean less often."""
 
     CONSTANT = 0
     PARAMETER = 1
@@ -66,7 +66,7 @@ class Node:
         return f"%{self.number} = {self.op}({shown})"
 
 
-# Every scalar operation with its meaning; the emitters know the same ones.
+# Every scalar operation with its meaning; the emitters support the same set.
 EVALUATE: dict[str, Callable[..., Any]] = {
     **{
         name: getattr(np, name)
@@ -102,7 +102,7 @@ class Graph:
         return len(self._nodes)
 
     def _intern(self, op: str, args: tuple[Node, ...], value: Any, rate: UpdateRate) -> Node:
-        # By repr, -0.0 and 0.0 differ, True and 1.0 differ, and NaN is equal to itself.
+        # With repr, -0.0 and 0.0 differ, True and 1.0 differ, and NaN equals itself.
         key = (op, *(a.number for a in args)) if args else (op, repr(value))
         node = self._nodes.get(key)
         if node is None:
@@ -110,7 +110,7 @@ class Graph:
         return node
 
     def constant(self, value: float | bool) -> Node:
-        """A literal; booleans stay booleans, every other number becomes a float."""
+        """A literal; booleans remain booleans, all other numbers become floats."""
         value = bool(value) if isinstance(value, (bool, np.bool_)) else float(value)
         return self._intern("constant", (), value, UpdateRate.CONSTANT)
 
@@ -129,13 +129,13 @@ class Graph:
         simpler = rule(self, *args) if rule else None
         if simpler is not None:
             return simpler
-        # In one order, so that a + b and b + a are one node.
+        # In canonical order, so that a + b and b + a are one node.
         if op in _COMMUTATIVE and args[0].number > args[1].number:
             args = args[::-1]
         return self._intern(op, args, None, rate)
 
     def total(self, terms: Sequence[Node], op: str = "add") -> Node:
-        """`terms` folded by `op` as a balanced tree: less rounding, more parallelism."""
+        """`terms` reduced by `op` as a balanced tree: less round-off, more parallelism."""
         if not terms:
             return self.constant(0.0)
         while len(terms) > 1:
@@ -144,7 +144,7 @@ class Graph:
         return terms[0]
 
     def known(self, op: str, *args: Node) -> bool:
-        """Return true if this very operation is already in the graph."""
+        """Return true if exactly this operation is already in the graph."""
         return (op, *(a.number for a in args)) in self._nodes
 
 
@@ -167,14 +167,14 @@ def reachable(outputs: Iterable[Node], stop: Iterable[Node] = ()) -> list[Node]:
         seen[node.number] = node
         if node.number not in border:
             stack.extend(node.args)
-    # Numbers rise with creation and arguments are created first: sorting is topological.
+    # Node numbers increase and arguments are created first, so sorting is topological.
     return [seen[number] for number in sorted(seen)]
 
 
 def evaluate(outputs: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Values of `outputs` by NumPy, each of the batch's shape.
+    """Values of `outputs` computed with NumPy, each with the shape of the batch.
 
-    The last axis of an input is the flat index, leading axes are a batch.
+    The last axis of an input is the flat index; leading axes are a batch.
     """
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):
@@ -189,10 +189,10 @@ def evaluate(outputs: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[
     return [np.asarray(values[node.number]) for node in outputs]
 
 
-# Rules that make an operation simpler without changing its value. Signs are moved outward (exactly:
-# rounding is symmetric) so that a - b and b - a share a node. A literal zero annihilates its
-# partner even though 0 * NaN is NaN: a zero written in the model says "no such coupling", and
-# whoever runs the code tests the state itself for NaN.
+# Rules that simplify an operation without changing its value. Signs are moved outward (which is
+# exact, as rounding is symmetric), so that a - b and b - a share a node. A product with a literal
+# zero is zero even though 0 * NaN is NaN: a zero written in the model means "no such coupling", and
+# callers test the state itself for NaN.
 Rule = Callable[..., Node | None]
 
 
@@ -248,7 +248,7 @@ def _div(g: Graph, a: Node, b: Node) -> Node | None:
 
 
 def _unsigned(g: Graph, op: str, a: Node, b: Node) -> Node | None:
-    """A product or quotient with the signs of its operands in front of it."""
+    """A product or quotient with the signs of its operands moved in front."""
     signs = (a.op == "neg") + (b.op == "neg")
     if not signs:
         return None
@@ -280,7 +280,7 @@ def _where(g: Graph, condition: Node, a: Node, b: Node) -> Node | None:
 
 
 def _logical(deciding: bool) -> Rule:
-    """The rule of a conjunction or disjunction, which one such operand decides."""
+    """The rule for a conjunction or disjunction, which one `deciding` operand determines."""
 
     def rule(g: Graph, a: Node, b: Node) -> Node | None:
         for x, y in ((a, b), (b, a)):
@@ -296,7 +296,7 @@ def _same(g: Graph, a: Node, b: Node) -> Node | None:
 
 
 def _mirrored(op: str, odd: bool) -> Rule:
-    """The rule of an odd or even function."""
+    """The rule for an odd or even function."""
 
     def rule(g: Graph, a: Node) -> Node | None:
         if a.op != "neg":

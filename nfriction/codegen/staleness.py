@@ -1,9 +1,9 @@
-"""Fingerprints of all that a trace may read: compiled code is stale once its fingerprint changes.
+"""Fingerprints of all that a trace may read: compiled code is stale if its fingerprint changes.
 
-Python code reads far more than its arguments: globals, closures, attributes of objects that it
-holds, elements of arrays. All of that is followed here from the traced objects on, by what their
-functions name, and compared by value. What cannot be compared (an open file, an object of a C
-library) is an error that names it; then only another trace says what the code computes now.
+Python code reads far more than its arguments: globals, closures, attributes of objects, elements
+of arrays. Starting from the traced objects, all of these are followed here by the names that
+functions use, and compared by value. An object that cannot be compared (an open file, an object of
+a C library) raises an error that names it; then only another trace shows what the code computes.
 """
 
 import builtins
@@ -30,13 +30,13 @@ class _Read(NamedTuple):
     imports: tuple[str, ...]
 
 
-# Packages whose functions and classes never change, so that they need not be followed.
+# Packages whose functions and classes never change, so they need not be followed.
 _CONSTANT = frozenset({
     *("nfriction", "torch", "numpy", "builtins", "math", "cmath", "operator", "_operator", "abc"),
     *("functools", "_functools", "itertools", "collections", "types", "typing", "dataclasses"),
     *("enum", "contextlib", "numbers"),
 })  # fmt: skip
-# Built-in functions that reach what no name shows.
+# Built-in functions that access objects not visible from names.
 _REACHING = frozenset({
     *("open", "input", "eval", "exec", "globals", "locals", "vars", "getattr", "__import__"),
 })  # fmt: skip
@@ -47,7 +47,7 @@ _ATOMS = frozenset({
 _SEQUENCES = frozenset({list, tuple, set, frozenset})
 _MAPPINGS = frozenset({dict, OrderedDict, types.MappingProxyType})
 _TENSORS = frozenset({Tensor, nn.Parameter})
-# Attributes that decide what objects of these classes compute.
+# Attributes that determine what objects of these classes compute.
 _HOLDING: dict[type, tuple[str, ...]] = {
     types.MethodType: ("__func__", "__self__"),
     functools.partial: ("func", "args", "keywords"),
@@ -55,26 +55,26 @@ _HOLDING: dict[type, tuple[str, ...]] = {
     classmethod: ("__func__",),
     property: ("fget", "fset"),
 }
-# Fields of every module; those that decide what it computes are followed by themselves.
+# Fields of every module; those that determine what it computes are followed separately.
 _OF_MODULES = frozenset(vars(nn.Module())) - {"training"}
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks")
-# Parts of a fingerprint; following more of them takes longer than another trace.
+# Limit on the parts of a fingerprint; following more takes longer than another trace.
 _LIMIT = 20_000
-_HEAP_TYPE = 1 << 9  # of a class's flags: made by Python code
-# Of an object that has its attributes and a place for weak references, and nothing else.
+_HEAP_TYPE = 1 << 9  # flag of a class that was created by Python code
+# Size of an object that has only attributes and a slot for weak references.
 _PLAIN_SIZE = type("Plain", (), {}).__basicsize__
 
 
 def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Hashable:
-    """A value that differs where the code traced from these objects may differ.
+    """A value that differs if the code traced from these objects may differ.
 
     Args:
-        modules: their floating-point parameters and buffers are inputs of the traced code, so that
-            shapes count and values do not.
+        modules: their floating-point parameters and buffers are inputs of the traced code, so only
+            their shapes matter, not their values.
         others: further functions and values that the trace reads.
 
     Raises:
-        Incomparable: if they reach something that cannot be compared, named.
+        Incomparable: if they reach something that cannot be compared; the error names it.
     """
     walk = _Walk(modules)
     try:
@@ -89,7 +89,7 @@ def content(value: Any) -> bytes:
     """Elements of a tensor or an array.
 
     Raises:
-        Incomparable: if it has none that can be read.
+        Incomparable: if its elements cannot be read.
     """
     if not isinstance(value, Tensor):
         if value.dtype.hasobject:
@@ -125,7 +125,7 @@ def _is_constant(module: Any) -> bool:
 
 
 class _Walk:
-    """One walk over all that can be reached; `parts` is a text of it in hashable pieces."""
+    """A walk over everything that can be reached; `parts` describes it in hashable pieces."""
 
     def __init__(self, modules: Iterable[nn.Module]) -> None:
         self.parts: list[Any] = []
@@ -144,14 +144,14 @@ class _Walk:
         if kind in _ATOMS:
             parts.append(value)
         elif kind is float or kind is complex:
-            parts.append(repr(value))  # tells signs of zero apart, and NaN equals itself
+            parts.append(repr(value))  # distinguishes signs of zero, and NaN equals itself
         elif kind in _TENSORS or kind is np.ndarray or isinstance(value, np.generic):
             parts += (value.shape, value.dtype, content(value))
         elif self._is_new(id(value)):
             self._compound(kind, value)
 
     def _is_new(self, *key: Hashable) -> bool:
-        """False where the same was met before, so that circles end."""
+        """False if the same object was met before, so that cycles end."""
         new = key not in self.seen
         self.parts.append(self.seen.setdefault(key, len(self.seen)))
         return new
@@ -210,7 +210,7 @@ class _Walk:
                 self.add(vars(module)[name])
         ours = _is_constant(type(module).__module__)
         for name, value in vars(module).items():
-            # The library's modules keep descriptions, which no step reads, in private containers.
+            # In private containers, modules of the library keep descriptions, which no step reads.
             if name in _OF_MODULES or (ours and name[0] == "_" and isinstance(value, list | dict)):
                 continue
             self.parts.append(name)
@@ -233,7 +233,7 @@ class _Walk:
                 self.add(values)
 
     def _named(self, function: types.FunctionType, read: _Read) -> None:
-        """All that a function names outside itself."""
+        """Everything outside a function that it refers to by name."""
         for name in read.imports:
             if not _is_constant(name):
                 raise Incomparable(f"`{function.__qualname__}`, which imports `{name or '.'}`")
@@ -245,7 +245,7 @@ class _Walk:
                 raise Incomparable(f"`{function.__qualname__}`, which calls `{name}`")
 
     def _reached(self, value: Any, attributes: frozenset[str]) -> None:
-        """A global; of a module, all names that the function also mentions."""
+        """Follow a global; if it is a module, all of its names that the function also uses."""
         if not isinstance(value, types.ModuleType) or _is_constant(value.__name__):
             self.add(value)
             return
@@ -260,7 +260,7 @@ class _Walk:
             self.parts.append(base)
             if not _is_constant(base.__module__):
                 for name, value in vars(base).items():
-                    # Of the names that Python gives, functions alone compute something.
+                    # Of the names defined by Python, only functions compute something.
                     given = name.startswith("__") or name == "_abc_impl"
                     if issubclass(base, enum.Enum):
                         given = name.startswith("_") and name != "_member_map_"
@@ -269,7 +269,7 @@ class _Walk:
                         self.add(value)
 
     def _object(self, kind: type, value: Any) -> None:
-        """An object of a class in Python: its class and all of its attributes."""
+        """Follow an object of a Python class: its class and all of its attributes."""
         python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
         if not python or kind.__basicsize__ > _PLAIN_SIZE or not hasattr(value, "__dict__"):
             raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")

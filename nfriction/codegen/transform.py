@@ -1,7 +1,7 @@
-"""Rewrite traced programs: exact derivatives, and what a rollout computes once, not in every step.
+"""Rewrite traced programs: exact derivatives, and hoisting of step-invariant computations.
 
-Derivatives are in forward mode on the scalar graph. What depends on parameters alone is hoisted out
-of the steps.
+Derivatives use forward mode on the scalar graph. Values that depend only on parameters are hoisted
+out of the steps.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,7 +22,7 @@ Rule = Callable[..., Node]
 
 
 def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
-    """The program with a last output: its Jacobian by the inputs named, (outputs, inputs), flat."""
+    """The program with its Jacobian by the named inputs, (outputs, inputs), as last output."""
     graph = program.graph
     outputs = [node for port in program.outputs for node in port.nodes]
     one, zero = graph.constant(1.0), graph.constant(0.0)
@@ -37,13 +37,13 @@ def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
 
 
 def tangents(graph: Graph, nodes: Iterable[Node], seed: Tangents) -> dict[int, Node]:
-    """Derivatives by node number along the direction of a seed; none where they are zero.
+    """Derivatives by node number along the direction of a seed; omitted where they are zero.
 
-    `nodes` come with all that they need, arguments first.
+    `nodes` include everything that they need, arguments first.
     """
     found = dict(seed)
     for node in nodes:
-        # Comparisons jump: their derivative is zero wherever they have one.
+        # Comparisons are step functions: their derivative is zero wherever it exists.
         if not any(a.number in found for a in node.args) or is_predicate(node):
             continue
         moving = [found.get(a.number) for a in node.args]
@@ -74,20 +74,20 @@ def _div(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
     b = node.args[1]
     if db is None:
         return g.apply("div", _one(da), b)
-    # By the quotient itself, which is known: (da - (a / b) db) / b.
+    # Uses the quotient itself, which is known: (da - (a / b) db) / b.
     fall = g.apply("mul", node, db)
     over = g.apply("neg", fall) if da is None else g.apply("sub", da, fall)
     return g.apply("div", over, b)
 
 
 def _where(g: Graph, node: Node, _: Node | None, da: Node | None, db: Node | None) -> Node:
-    # Only the branch taken counts; a NaN of the other one is not passed on.
+    # Only the branch taken matters; NaN from the other one is not propagated.
     zero = g.constant(0.0)
     return g.apply("where", node.args[0], da or zero, db or zero)
 
 
 def _select(op: str) -> Rule:
-    """The larger or smaller operand's derivative."""
+    """The rule for a maximum or minimum: the derivative of the selected operand."""
 
     def rule(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
         zero = g.constant(0.0)
@@ -99,7 +99,7 @@ def _select(op: str) -> Rule:
 
 
 def _chain(slope: Callable[[Graph, Node, Node], Node]) -> Rule:
-    """A function of one argument; `slope` is given the graph, the argument and the value."""
+    """The rule for a function of one argument; `slope` gets the graph, argument and value."""
 
     def rule(g: Graph, node: Node, da: Node | None) -> Node:
         return g.apply("mul", slope(g, node.args[0], node), _one(da))
@@ -145,9 +145,9 @@ Groups = Sequence[Sequence[Node]]
 
 
 def hoist(graph: Graph, groups: Groups) -> tuple[list[tuple[Node, ...]], list[Node]]:
-    """The groups to compute in every step, and the nodes in them that parameters alone decide.
+    """The groups to compute in every step, and their nodes that depend only on parameters.
 
-    Those come once, arguments first. The graph is extended where products are regrouped.
+    Each of these nodes is listed once, arguments first. Regrouping products extends the graph.
     """
     outputs = _regrouped(graph, [node for group in groups for node in group])
     read = {
@@ -165,9 +165,9 @@ def hoist(graph: Graph, groups: Groups) -> tuple[list[tuple[Node, ...]], list[No
 def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
     """Rewrite products so that their less volatile factors meet first and can be hoisted.
 
-    `(a * x) * b` becomes `(a * b) * x` where a and b live longer than x, and dividing by a
-    longer-lived value becomes multiplying by its reciprocal. Each moves a result by an ulp or
-    two; sums are left alone, because regrouping them can cancel.
+    `(a * x) * b` becomes `(a * b) * x` if a and b change less often than x, and division by such a
+    value becomes multiplication by its reciprocal. Each changes a result by one or two units in the
+    last place; sums are left alone, because regrouping them can cause cancellation.
     """
     nodes = reachable(outputs)
     uses: dict[int, int] = {}
@@ -184,7 +184,7 @@ def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
     done: dict[int, Node] = {}
     factors: dict[int, list[Node]] = {}
     one = graph.constant(1.0)
-    # Arguments come before their users, so that each is rewritten when it is asked for.
+    # Arguments precede their users, so each is already rewritten when it is needed.
     for node in nodes:
         args = [done[a.number] for a in node.args]
         if node.op == "mul":
@@ -203,7 +203,7 @@ def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
 
 
 def _product(graph: Graph, parts: Sequence[Node]) -> Node:
-    """The product of what is computed once, as a tree, and of the others, in order."""
+    """The product of the factors computed once, as a tree, and of the others, in order."""
     once = [part for part in parts if part.rate < UpdateRate.STEP]
     others = [part for part in parts if part.rate == UpdateRate.STEP]
     products = [graph.total(once, "mul")] if once else []

@@ -7,15 +7,15 @@ A law gives the friction torque tau_f on the left-hand side of
 Every law here is a function `(qd, load, coefficients, v_smooth) -> tau_f` of
 
     qd            joint velocity [rad/s], shape (*batch, joint)
-    load          normal force |N| on the joint's bearing over the weight m g of its link [-],
-                  shaped like `qd`; only load-dependent laws read it
+    load          normal force |N| on the joint's bearing divided by the weight m g of its link
+                  [-], same shape as `qd`; used only by load-dependent laws
     coefficients  shape (*batch, joint, coefficient), in the order of the law's description
     v_smooth      velocity over which the sign of the velocity changes [rad/s]
     tau_f         friction torque [N m], shape (*batch, joint)
 
-that can be scripted by TorchScript, exported and broadcast. For a sliding axis read m for rad and N
-for N m. A law of your own is one such function with a description of its coefficients, a `Law`. The
-next step is `nfriction.friction.coefficients`: the coefficients as a function of the motion.
+which can be compiled by TorchScript, exported and broadcast. For a sliding axis, read m for rad and
+N for N m. To define your own law, write such a function and describe its coefficients in a `Law`.
+The next step is `nfriction.friction.coefficients`: the coefficients as a function of the motion.
 
 References:
     Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), for Coulomb, viscous and
@@ -41,19 +41,19 @@ class Coefficient:
     Attributes:
         name: symbol, e.g. `"B"`.
         unit: SI unit for a revolute joint.
-        positive: positive by physics, hence kept positive by construction.
+        positive: physically positive, and therefore kept positive by construction.
         linear: the torque is linear in it, so linear least squares estimates it.
-        initial_grid: start values to try where the torque is not linear in it.
+        initial_grid: start values to try if the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
         prior_scale: standard deviation of a prior around zero, relative to the RMS of the joint's
-            friction torque, or itself where the coefficient has no unit; infinite for none. Meant
-            for effects that are small in most joints.
-        stores: belongs to a hidden state, such as the energy of a law's memory or a joint's heat,
-            so that networks leave it constant.
+            friction torque (absolute if the coefficient has no unit); infinite for no prior.
+            Intended for effects that are small in most joints.
+        stores: belongs to a hidden state, such as the energy in a law's memory or a joint's heat,
+            so that networks keep it constant.
 
     Raises:
-        ValueError: if a nonlinear coefficient has no initial grid, or has a prior, or a start value
-            that its sign or size forbids.
+        ValueError: if a nonlinear coefficient has no initial grid or has a prior, or if a start
+            value has a forbidden sign or is not finite.
     """
 
     name: str
@@ -84,13 +84,13 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Memory:
-    """Internal state of a law; `nfriction.friction.memory` has the contract and such laws.
+    """Internal state of a law; see `nfriction.friction.memory` for the contract and such laws.
 
     Attributes:
         size: of each joint's state.
-        advance: `(state, qd, load, coefficients, time_step) -> state` over a sample.
+        advance: `(state, qd, load, coefficients, time_step) -> state` over one sample.
         torque: `(state, qd, load, coefficients) -> tau_f` at the end of a sample.
-        transmitted: the load is the torque that the drive transmits [N m], no normal load.
+        transmitted: the load is the torque that the drive transmits [N m] instead of a normal load.
     """
 
     size: int
@@ -112,17 +112,17 @@ class Law:
     Attributes:
         name: name of the law.
         coefficients: in the order of the coefficients' last axis.
-        torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable; of a law
-            with memory the steady torque, approached at a constant velocity.
+        torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable; for a
+            law with memory, the steady-state torque at constant velocity.
         nested_law: a simpler law that this one contains: the torque is the same if all
-            coefficients except `nested_coefficients` are zero, or only shape a zero term. A law
-            with several minima is also fitted from the end of its nested law's fit.
-        nested_coefficients: names, here, of the nested law's coefficients, in its order.
-        memory: internal state of a law whose torque depends on more than the present motion; None
-            of a law without.
+            coefficients except `nested_coefficients` are zero or only shape a term that is zero. A
+            law with several minima is also fitted starting from the fit of its nested law.
+        nested_coefficients: names that the nested law's coefficients have here, in its order.
+        memory: internal state of a law whose torque depends on more than the current motion; None
+            for a law without memory.
 
     Raises:
-        TypeError: if a coefficient, the torque or the nested law is something else.
+        TypeError: if a coefficient, the torque or the nested law has the wrong type.
         ValueError: if there is no coefficient, two have the same name, or the nested coefficients
             do not match the nested law.
 
@@ -170,7 +170,7 @@ class Law:
                 )
 
     def __deepcopy__(self, memo: object) -> "Law":
-        return self  # nothing of it can change, and fits copy their models at every search
+        return self  # immutable, and fits copy their models for every search
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,23 +179,23 @@ class Law:
 
     @property
     def reads_drive(self) -> bool:
-        """True of a law whose load is the torque that the drive transmits."""
+        """True for a law whose load is the torque that the drive transmits."""
         return self.memory is not None and self.memory.transmitted
 
     @property
     def state_size(self) -> int:
-        """Size of each joint's internal state; 0 of a law without memory."""
+        """Size of each joint's internal state; 0 for a law without memory."""
         return self.memory.size if self.memory else 0
 
     def initial_state(self, qd: Tensor) -> Tensor:
-        """Internal state before the first sample, none deflected, (*batch, joint, state)."""
+        """Internal state before the first sample, undeflected, (*batch, joint, state)."""
         return qd.new_zeros((*qd.shape, self.state_size))
 
 
 def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:
-    """Sign of the velocity with a smooth passage through zero: `tanh(qd / v_smooth)`.
+    """Sign of the velocity with a smooth transition through zero: `tanh(qd / v_smooth)`.
 
-    Written sgn below. A true sign would jump, which an explicit integrator cannot follow.
+    Written sgn below. An explicit integrator cannot follow the jump of the exact sign function.
     """
     return torch.tanh(qd / v_smooth)
 
@@ -241,9 +241,9 @@ def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) ->
     make the law passive (eq. (8) of Armstrong-Helouvry et al.).
     """
     f_c, f_d, f_v, v_s, delta = coefficients.unbind(-1)
-    # A millionth of v_s is added in quadrature, so that the power's slope is finite at qd = 0 for
-    # every delta. The power stops at e^7, where the exponential underflows: 0 times its infinite
-    # slope would be NaN.
+    # A millionth of v_s is added in quadrature, so that the slope of the power is finite at qd = 0
+    # for every delta. The power is limited to e^7, where the exponential underflows; otherwise 0
+    # times its infinite slope would be NaN.
     log_ratio = 0.5 * torch.log((qd / v_s).square() + 1e-12)
     drop = torch.exp(-torch.exp((delta * log_ratio).clamp(max=7.0)))
     return (f_c + f_d * drop) * smooth_sign(qd, v_smooth) + f_v * qd
@@ -269,8 +269,8 @@ NONLINEAR = Law(
         Coefficient("f_c", "N m"),
         Coefficient("f_v", "N m s/rad"),
         Coefficient("f_a", "N m"),
-        # The reciprocal of the velocity at which the arctangent has risen by half: from 0.1 to 10
-        # rad/s, the range in which joints move.
+        # The reciprocal of the velocity at which the arctangent reaches half of its limit: 0.1 to
+        # 10 rad/s, the range in which joints move.
         Coefficient("f_b", "s/rad", linear=False, initial_grid=(0.1, 0.3, 1.0, 3.0, 10.0)),
     ),
     nonlinear,
@@ -282,7 +282,7 @@ STRIBECK = Law(
     "stribeck",
     (
         Coefficient("F_c", "N m"),
-        # A peak at rest that is narrower than the sign's passage hardly shows in the data.
+        # A peak at rest that is narrower than the smoothed sign is hardly visible in the data.
         Coefficient("F_d", "N m", prior_scale=1.0),
         Coefficient("F_v", "N m s/rad"),
         Coefficient("v_s", "rad/s", linear=False, initial_grid=(0.03, 0.1, 0.3, 1.0, 3.0)),

@@ -1,4 +1,4 @@
-"""Neuro-fuzzy models: coefficients as a network's function of velocity and acceleration."""
+"""Neuro-fuzzy models: a network gives coefficients as functions of velocity and acceleration."""
 
 import math
 import reprlib
@@ -21,14 +21,14 @@ from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.fuzzy.partition import FreePartition
 
-# A coefficient below a thousandth of its scale starts there: from zero it could not rise.
+# Smallest initial ratio of a coefficient to its scale: starting from zero it could not rise.
 LEAST_RATIO = 1e-3
-# One that no fit varies need not rise, such as the fall by heat of a joint that has none.
+# A coefficient that no fit varies need not rise, e.g. the effect of heat in a joint without it.
 NO_RATIO = 1e-6
-# With a third of it the network is too stiff to follow large swings, and then wrong at smaller
-# ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
+# With a third of this, the network is too stiff to follow large swings, and then wrong at smaller
+# ones: 6.8 mrad instead of 3.0 on later swings of a real pendulum (its constant law: 5.3).
 PRIOR_SD = 0.3
-# Of the logistic distribution: that of the logit of a share about which nothing is known.
+# SD of the logistic distribution, which is that of the logit of a uniformly distributed fraction.
 LOGIT_SD = math.pi / math.sqrt(3.0)
 
 
@@ -43,7 +43,7 @@ def smooth_relu_inverse(y: Tensor, roundness: float) -> Tensor:
 
 
 def taper(beyond: Tensor, reach: float) -> Tensor:
-    """1 within a range and 0 from `reach` outside it on, `(1 - |e|^2 / reach^2)^2` between.
+    """1 within a range, 0 beyond a distance `reach` from it, `(1 - |e|^2 / reach^2)^2` between.
 
     `beyond` is e, the distance of each input from its range, (..., input).
     """
@@ -53,7 +53,7 @@ def taper(beyond: Tensor, reach: float) -> Tensor:
 
 
 def taper_slope(beyond: Tensor, reach: float) -> Tensor:
-    """Derivative of `taper` by each input's distance from its range, (..., input)."""
+    """Derivative of `taper` with respect to each input's distance from its range, (..., input)."""
     beyond = beyond / reach
     rest = (1.0 - (beyond * beyond).sum(-1, keepdim=True)).clamp_min(0.0)
     return -4.0 / reach * rest * beyond
@@ -64,25 +64,25 @@ class NeuroFuzzy(Schedule):
 
     Inputs are |velocity| and acceleration, scaled to their trained range and clamped to it. The
     network's output is the deviation from a constant reference, in units of a scale; it starts at
-    zero, so an untrained model *is* the constant law, and a prior around zero pulls toward it.
+    zero, so an untrained model *is* the constant law, and a zero-mean prior pulls toward it.
     Beyond the trained range the deviation tapers off to the constant law.
 
     Args:
         law: the law whose coefficients these are.
         joints: number of joints.
         initial: reference coefficients in SI, (joint, coefficient) or (coefficient,).
-        terms: fuzzy sets of velocity and of acceleration.
-        head_units: units of the radial basis head.
-        acceleration: `"along_motion"` takes qdd sgn(qd), so that friction is the same in both
-            directions; `"signed"` takes qdd as the papers do.
-        interpretable: keep the sets ordered, in range and overlapping, also while a fit moves them.
+        terms: numbers of fuzzy sets of velocity and of acceleration.
+        head_units: number of units of the radial basis head.
+        acceleration: `"along_motion"` uses qdd sgn(qd), so that friction is the same in both
+            directions; `"signed"` uses qdd, like the papers.
+        interpretable: keep the sets ordered, in range and overlapping, even when a fit moves them.
         prior_sd: standard deviation of the network's parameters around the start of a fit:
             consequents and weights in units of the coefficients' scale, widths as logarithms,
-            centres in widths. A fit also tries a third of it for the weights, and finds that of
-            the sets by evidence.
+            centres in widths. A fit also tries a third of this for the weights, and determines
+            that of the sets by evidence.
 
     Attributes:
-        learn_sets: whether a fit moves the sets and the head's units besides what they weigh.
+        learn_sets: whether a fit moves the sets and the head's units in addition to their weights.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -90,10 +90,10 @@ class NeuroFuzzy(Schedule):
 
     form = "neurofuzzy"
 
-    # Final makes them constants for TorchScript.
-    roundness: Final[float] = 0.005  # of the positive map, in units of a coefficient's scale
-    reach: Final[float] = 0.5  # distance from the trained range where it is zero, in ranges
-    turn: Final[float] = 3e-3  # width of the sign of qdd sgn(qd), in ranges of the velocity
+    # `Final` makes these constants for TorchScript.
+    roundness: Final[float] = 0.005  # of `smooth_relu`, in units of a coefficient's scale
+    reach: Final[float] = 0.5  # distance from the trained range at which `taper` is zero, in ranges
+    turn: Final[float] = 3e-3  # width of the smooth sign in qdd sgn(qd), in ranges of the velocity
 
     fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
@@ -133,7 +133,7 @@ class NeuroFuzzy(Schedule):
                 f"acceleration, got {reprlib.repr(terms)}."
             )
         k = len(law.names)
-        # The last coefficients of some laws no fit varies, such as those of heat.
+        # No fit varies the last coefficients of some laws, such as those of heat.
         self.outputs = max((i + 1 for i in range(k) if self.fitted_mask[i]), default=1)
         self.unvaried = k - self.outputs
         self.terms, self.head_units = tuple(terms), head_units
@@ -149,12 +149,12 @@ class NeuroFuzzy(Schedule):
         for name in ("velocity_range", "acceleration_lower", "acceleration_upper"):
             self.register_buffer(name, torch.ones(joints, dtype=torch.float64))
         self.set_reference(Constant(law, joints, initial).values)
-        # As wide as the papers' motion; a fit sets the range of its recordings.
+        # As wide as in the papers; a fit sets the range of its recordings.
         self.set_range(20.0, [-200.0, 200.0])
 
     def scaled(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Inputs over their trained range, within it in [0, 1], shape (*batch, joint, 2)."""
-        # Of |velocity|, so that friction is odd in the velocity without any training.
+        """Inputs scaled to [0, 1] over their trained range, shape (*batch, joint, 2)."""
+        # Uses |velocity|, so that friction is odd in the velocity without any training.
         velocity = qd / self.velocity_range
         if self.along_motion:
             qdd = qdd * torch.tanh(velocity / self.turn)
@@ -195,7 +195,7 @@ class NeuroFuzzy(Schedule):
         lower = torch.stack([torch.zeros_like(self.velocity_range), self.acceleration_lower], -1)
         upper = torch.stack([self.velocity_range, self.acceleration_upper], -1)
         centres, widths = (x.split(self.terms, -1) for x in self.network.anfis.sets())
-        # Every pair of centres is a sample, all joints at once; the acceleration varies faster.
+        # Every pair of centres is a sample, for all joints at once; acceleration varies fastest.
         v, a = (c.clamp(0.0, 1.0).T for c in centres)
         pairs = [v.repeat_interleave(self.terms[1], 0), a.repeat(self.terms[0], 1)]
         found = self.to_coefficients(self.reference + self.deviation(torch.stack(pairs, -1)))
@@ -218,14 +218,14 @@ class NeuroFuzzy(Schedule):
         Args:
             values: coefficients in SI, (joint, coefficient).
             scale: unit of the deviation of a coefficient, (joint, coefficient); at least its value,
-                which is also the default (1 where that is zero).
+                which is also the default (1 if that is zero).
             least: smallest ratio of a positive coefficient to its scale; smaller ones are raised.
         """
         values = values.to(self.reference)
         size = values.abs()
         if scale is not None:
             size = torch.maximum(size, scale.to(size))
-        # A coefficient of zero has no size to be a unit.
+        # A coefficient of zero cannot be its own unit.
         self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
         lowest = torch.full_like(ratio, least)
@@ -240,9 +240,9 @@ class NeuroFuzzy(Schedule):
         """Set the trained range, beyond which the network's output tapers off.
 
         Args:
-            velocity: largest |velocity| of each joint [rad/s], (joint,) or one for all.
+            velocity: largest |velocity| of each joint [rad/s], (joint,) or one for all joints.
             acceleration: smallest and largest acceleration [rad/s^2], (joint, 2) or (2,); along
-                the motion where the schedule takes it so.
+                the motion if the schedule uses it in that form.
 
         Raises:
             ValueError: if a range is empty or not finite.
@@ -273,8 +273,8 @@ class NeuroFuzzy(Schedule):
     def trained(self) -> tuple[nn.Parameter, ...]:
         """The parameters that a trajectory fit varies, each (joint, ...).
 
-        First the `weights`. Then the sets' parameters, and the centres and widths of the head's
-        units.
+        First the `weights`, then the parameters of the sets and the centres and widths of the
+        head's units.
         """
         if not self.learn_sets:
             return self.weights()
@@ -284,8 +284,8 @@ class NeuroFuzzy(Schedule):
     def weights(self) -> tuple[nn.Parameter, nn.Parameter]:
         """Parameters that enter the coefficients almost linearly, (joint, coefficient, ...).
 
-        The rules' planes and the weights of the head. The head's bias stays zero: it would double
-        the rules' constants, and halve the prior on them.
+        The consequents of the rules and the weights of the head. The head's bias stays zero: it
+        would be redundant with the rules' constants, and would halve the prior on them.
         """
         return self.network.anfis.consequents, self.network.head.output_weight
 
@@ -318,7 +318,7 @@ class NeuroFuzzy(Schedule):
         return names
 
     def group_names(self) -> tuple[str, ...]:
-        """A name for each tensor of `trained`, whose parameters share a prior."""
+        """Names of the tensors in `trained`; the parameters of each share a prior."""
         sets = tuple(
             f"set {name.removeprefix('log_')}"
             for name, _ in self.network.anfis.partition.named_parameters()
@@ -327,7 +327,7 @@ class NeuroFuzzy(Schedule):
         return names[: len(self.trained())]
 
     def groups(self) -> Tensor:
-        """Place in `group_names` of each parameter's group, (parameter,)."""
+        """Index in `group_names` of each parameter's group, (parameter,)."""
         sizes = torch.tensor([p.numel() for p in self.trained()])
         return torch.arange(len(sizes)).repeat_interleave(sizes)
 
@@ -342,11 +342,11 @@ class NeuroFuzzy(Schedule):
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation: zero for the network's output, its sets where they are."""
+        """Mean and standard deviation: mean zero for weights, the current values for sets."""
         partition, head = self.network.anfis.partition, self.network.head
         mean, units = self.parameter_vector(), {}
         mean[: sum(p.numel() for p in self.weights())] = 0.0
-        # Centres in units of widths, spacings as logits, all others relative as they are.
+        # Centres are in units of widths, spacings are logits, and all others are relative already.
         units[head.centres] = head.log_widths.detach().exp()
         if isinstance(partition, FreePartition):
             units[partition.centres] = partition.log_widths.detach().exp()
@@ -357,7 +357,7 @@ class NeuroFuzzy(Schedule):
         return mean, self.prior_sd * torch.cat(sizes).detach()
 
     def belief(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation: of one unit, as a coefficient varies by its own size."""
+        """Mean, and a standard deviation of one unit: coefficients vary by about their own size."""
         mean, sd = self.prior()
         return mean, sd / self.prior_sd
 
@@ -365,7 +365,7 @@ class NeuroFuzzy(Schedule):
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 
-        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped, w
+        With x the scaled inputs, u the reference plus w n, n the network's outputs at clamped x, w
         their weight, v = qd / v_max and t = tanh(v / turn) (1 where acceleration is signed):
 
             du/dx   = w dn/dx within the range, n dw/dx beyond it,
@@ -392,7 +392,7 @@ class NeuroFuzzy(Schedule):
         x = scaled.clamp(0.0, 1.0)
         beyond = scaled - x
         by_x = self.network.input_jacobian(x.reshape(-1, self.joints, 2)).permute(3, 0, 1, 2)
-        # A clamped input no longer moves the network, only the weight of its output.
+        # A clamped input no longer affects the network itself, only the weight of its output.
         weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
@@ -406,14 +406,14 @@ class NeuroFuzzy(Schedule):
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
-            # The map to coefficients is elementwise, so the sum's gradient is its slope.
+            # The map to coefficients is elementwise, so its slope is the gradient of the sum.
             u = weight * pad(y + head(both), [0, self.unvaried])
             u = (self.reference + u).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
         own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
-        # The rules' outputs are inputs of the head, too.
+        # The outputs of the rules are also inputs of the head.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
         by_y = pad(by_y, [0, 0, 0, self.unvaried])
         by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
@@ -425,7 +425,7 @@ class NeuroFuzzy(Schedule):
         shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
         by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
         by_unit = by_head @ head.output_weight.repeat_interleave(head.inputs, -1)
-        # Of a unit's output by its centre and logarithmic width, both over the width squared.
+        # Derivatives of a unit's output by its centre and log width, both over the squared width.
         moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
         moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
         return Sensitivity(
@@ -458,12 +458,12 @@ class NeuroFuzzy(Schedule):
 class HeatedNeuroFuzzy(Heated, NeuroFuzzy):
     """Neuro-fuzzy coefficients of a law with heat."""
 
-    # TorchScript does not inherit that these are final.
+    # In TorchScript, `Final` is not inherited.
     __constants__ = ("roundness", "reach", "turn")
 
 
-# Coefficients by networks, as model files name them. The papers' own are resolved by name, because
-# the core does not import them.
+# Networks for coefficients, by their names in model files. The papers' own one is resolved by name,
+# because the core does not import the papers.
 NETWORKS = {
     "anfis": "nfriction.friction.neurofuzzy:NeuroFuzzy",
     "rbf": "nfriction.papers.nffem.rbf_coefficients:RBFCoefficients",
@@ -474,11 +474,11 @@ class NeuroFuzzyModel(NamedModel):
     """A law with coefficients from an ANFIS layer with a radial basis head, `NeuroFuzzy`.
 
     Args:
-        joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
+        joints, initial, v_smooth: see `NamedModel`; training starts from the constants `initial`.
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
-        inputs: what friction depends on besides speed and acceleration: `"direction"` of turning,
-            `"load"` of the bearing, `"heat"` of the joint, each by a coefficient of its own
-            (`with_inputs`); None lets a fit choose those that pay.
+        inputs: quantities other than speed and acceleration on which friction depends:
+            `"direction"` of rotation, `"load"` of the bearing, `"heat"` of the joint, each with its
+            own coefficient (`with_inputs`); with None, a fit selects the useful ones.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 
@@ -501,7 +501,7 @@ class NeuroFuzzyModel(NamedModel):
         self.inputs = None if inputs is None else list(inputs)
 
     def see(self, inputs: Sequence[str]) -> None:
-        """Take further inputs, with fresh coefficients."""
+        """Add further inputs, with initial coefficients."""
         options = {**self.options(), "inputs": inputs}
         self.__init__(self.joints, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
 
@@ -528,7 +528,7 @@ class NFNCFM(NeuroFuzzyModel):
 
 
 class NFCFM(NeuroFuzzyModel):
-    """Coulomb friction with a neuro-fuzzy F_c: any curve over velocity that is odd."""
+    """Coulomb friction with a neuro-fuzzy F_c: any odd function of velocity."""
 
     definition = laws.COULOMB
 

@@ -1,4 +1,4 @@
-"""Parameters of a schedule: given values checked, and derivatives of the coefficients by them."""
+"""Parameters of a schedule: checks of given values, and derivatives of the coefficients."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch import Tensor
 
 
 def positive_number(name: str, value: object, unit: str = "") -> float:
-    """A positive finite number, or an error that names it."""
+    """The value as a positive finite number; otherwise raise an error that names it."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        # NaN fails every comparison, so one message covers all.
+        # NaN fails every comparison, so a single message covers all cases.
         number = math.nan
     if not 0 < number < math.inf:
         unit = f" [{unit}]" if unit else ""
@@ -27,13 +27,13 @@ def positive_number(name: str, value: object, unit: str = "") -> float:
 
 
 def as_tensor(name: str, values: Any, like: Tensor | None = None) -> Tensor:
-    """Tensors as they are, arrays and lists in double precision or as `like`."""
+    """A tensor unchanged; an array or list in double precision or with the type of `like`."""
     if isinstance(values, Tensor) and like is None:
         return values
     dtype, device = (torch.float64, None) if like is None else (like.dtype, like.device)
     try:
         return torch.as_tensor(values, dtype=dtype, device=device)
-    # Ragged lists, texts, and whole numbers that exceed every float.
+    # Ragged lists, strings, and integers too large for a float.
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ValueError(
             f"{name} must be an array of numbers, got {reprlib.repr(values)}."
@@ -48,11 +48,11 @@ def checked_coefficients(
     Args:
         values: of that shape, (joint, coefficient) or (coefficient,).
         like: a tensor of the wanted shape and type.
-        names, positive: of the coefficients, and which must not be negative.
+        names, positive: names of the coefficients, and which of them must not be negative.
     """
     given = as_tensor("coefficients", values, like)
     joints, count = like.shape[0], like.shape[-1]
-    # Before any broadcast: one column would silently be taken for all coefficients.
+    # Before any broadcast: a single column would silently be used for all coefficients.
     if given.shape not in (like.shape, (joints, count), (count,)):
         whole = "" if like.ndim == 2 else f"the whole table {tuple(like.shape)}, "
         raise ValueError(
@@ -75,11 +75,11 @@ def checked_coefficients(
 def require_options(
     of: str, make: Callable[..., object], given: Iterable[str], own: Iterable[str] = ()
 ) -> None:
-    """Raise ValueError for options that neither a schedule has nor the model that makes it."""
-    # Behind the law, the joints and the initial values; cells are those of a schedule's own.
+    """Raise ValueError for options of neither a schedule nor the model that creates it."""
+    # Options follow the law, the joints and the initial values; cells are internal to a schedule.
     taken = [p for p in signature(make).parameters.values() if p.name != "cells"][3:]
     if any(p.kind is p.VAR_KEYWORD for p in taken):
-        # It hands options on, and refuses those itself.
+        # It passes options on to a callee, which checks them.
         return
     known = [*own, *(p.name for p in taken)]
     if unknown := [name for name in given if name not in known]:
@@ -92,15 +92,15 @@ def require_options(
 class Sensitivity:
     """Derivatives of the coefficients at given motions.
 
-    A parameter acts on one joint's coefficients only. The parameters come in groups, each laid out
-    as (joint, output, feature): an output is a sum of features with the parameters as weights, so
-    the derivative is an outer product, which is kept as its two factors.
+    A parameter affects the coefficients of only one joint. The parameters form groups, each of
+    shape (joint, output, feature): an output is a sum of features weighted by the parameters, so
+    the derivative is an outer product, which is stored as its two factors.
 
     Attributes:
-        factors: of each group, the coefficients' derivatives by the outputs, (sample, joint,
-            coefficient, output), and the features, (sample, joint, feature).
-        qd: by the joint's own velocity, (sample, joint, coefficient).
-        qdd: by the joint's own acceleration, (sample, joint, coefficient).
+        factors: for each group, the derivatives of the coefficients with respect to the outputs,
+            (sample, joint, coefficient, output), and the features, (sample, joint, feature).
+        qd: with respect to the joint's own velocity, (sample, joint, coefficient).
+        qdd: with respect to the joint's own acceleration, (sample, joint, coefficient).
     """
 
     factors: tuple[tuple[Tensor, Tensor], ...]
@@ -109,28 +109,28 @@ class Sensitivity:
 
     @classmethod
     def of_constants(cls, by_parameter: Tensor, motion: Tensor) -> Sensitivity:
-        """Derivatives of coefficients that do not follow the motion.
+        """Derivatives of coefficients that do not depend on the motion.
 
         Args:
-            by_parameter: (coefficient, parameter of a joint), or (sample, joint, ...) of these.
-            motion: joint velocities, (sample, joint), for the shape.
+            by_parameter: (coefficient, parameter of a joint), or (sample, joint, ...) in front.
+            motion: joint velocities, (sample, joint), used for their shape.
         """
         count = by_parameter.shape[-2]
         zero = by_parameter.new_zeros(()).expand(*motion.shape, count)
-        # Nothing is shared among the parameters, so their one feature is 1.
+        # The parameters share nothing, so their only feature is 1.
         one = by_parameter.new_ones(()).expand(*motion.shape, 1)
         return cls(((by_parameter.expand(*motion.shape, count, -1), one),), zero, zero)
 
     @property
     def parameters(self) -> Tensor:
-        """By the parameter vector, multiplied out, (sample, coefficient, parameter)."""
-        # Large, but only short stretches are asked for whole; sums over a motion use `contract`.
+        """Full derivative by the parameter vector, (sample, coefficient, parameter)."""
+        # Large, but only computed for short segments; sums over a motion use `contract`.
         whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
         return torch.cat(whole, -1)
 
     @property
     def joint(self) -> Tensor:
-        """The joint that each parameter acts on, (parameter,)."""
+        """The joint whose coefficients each parameter affects, (parameter,)."""
         rows = []
         for mix, features in self.factors:
             joints = torch.arange(mix.shape[1], device=mix.device)
@@ -138,11 +138,11 @@ class Sensitivity:
         return torch.cat(rows)
 
     def contract(self, cotangent: Tensor) -> Tensor:
-        """Derivatives by the parameters of quantities that depend on the coefficients.
+        """Parameter derivatives of quantities that depend on the coefficients.
 
         Args:
-            cotangent: derivatives by the coefficients at many samples, (block, row, sample, joint,
-                coefficient); the blocks' samples are those of this sensitivity, in order.
+            cotangent: derivatives with respect to the coefficients at many samples, (block, row,
+                sample, joint, coefficient); the blocks contain this sensitivity's samples in order.
 
         Returns:
             Shape (block, row, parameter).
@@ -152,7 +152,7 @@ class Sensitivity:
         for mix, features in self.factors:
             mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
             if features.shape[-1] == 1:
-                # Nothing is shared: one product over samples and coefficients is faster.
+                # No shared features: one product over samples and coefficients is faster.
                 by_parameter = (mix * features[..., None]).transpose(1, 2).flatten(2, 3)
                 both = cotangent.permute(0, 3, 1, 2, 4).flatten(3) @ by_parameter
             else:

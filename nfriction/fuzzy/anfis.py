@@ -1,4 +1,4 @@
-"""ANFIS: a Takagi-Sugeno layer with learnable memberships, groups (joints) stacked."""
+"""ANFIS: a Takagi-Sugeno layer with learnable memberships, with groups (joints) stacked."""
 
 import math
 from collections.abc import Sequence
@@ -15,33 +15,33 @@ from nfriction.fuzzy.partition import (
     even_centres,
 )
 
-# Rules are the product of the terms: a mistyped count would fill the memory.
+# The number of rules is the product of the terms; a mistyped count would exhaust the memory.
 MAX_RULES = 100_000
 
 Range = float | Sequence[float] | Tensor
-"""A bound of each input: what broadcasts to (groups, inputs)."""
+"""A bound of each input, broadcastable to (groups, inputs)."""
 
 
 class Anfis(LinearOutputModule):
-    """First-order (or zero-order) Takagi-Sugeno layer, several independent groups in one tensor.
+    """First-order (or zero-order) Takagi-Sugeno layer of several independent groups in one tensor.
 
     Each input has its own sets, shared by the rules; a rule picks one set of each input, so there
-    are prod(terms) of them, the last input's set running fastest. Memberships multiply, firing
-    strengths are normalised in the log domain, and the output is the strength-weighted mean of
-    the rules' linear functions of the inputs.
+    are prod(terms) rules, and the last input's set varies fastest. Memberships are multiplied,
+    firing strengths are normalised in the log domain, and the output is the strength-weighted mean
+    of the rules' linear functions of the inputs.
 
     Args:
-        groups: independent layers of the same shape, e.g. one a joint.
-        inputs: inputs of a group.
+        groups: independent layers of the same shape, e.g. one per joint.
+        inputs: number of inputs per group.
         terms: number of sets of each input.
-        outputs: outputs of a group.
+        outputs: number of outputs per group.
         order: 1 for linear consequents, 0 for constant ones.
         kind: "gaussian", or "bell" for generalised bells.
-        interpretable: keep the sets ordered, in range and overlapping at 0.5 or more.
+        interpretable: keep the sets ordered, in range and crossing at a membership of 0.5 or more.
 
     Parameters, by name: `partition.*` (centres and log-widths, or their ordered form), `log_slopes`
     (groups, sets; bells only), `consequents` (groups, outputs, rules, inputs + 1) with the
-    constant last, or (groups, outputs, rules, 1).
+    constant last, or (groups, outputs, rules, 1) for order 0.
 
     References:
         Jang (1993), ANFIS: Adaptive-Network-Based Fuzzy Inference System. Takagi and Sugeno (1985).
@@ -73,18 +73,18 @@ class Anfis(LinearOutputModule):
             partition = OrderedPartition(groups, self.terms, half_width, dtype)
         self.partition = partition
         sets = sum(self.terms)
-        # An empty parameter would be a trap for optimisers; Gaussians own no slopes at all.
+        # Gaussians have no slopes; an empty parameter would trip up optimisers.
         self.log_slopes = (
             nn.Parameter(torch.full((groups, sets), 2.0, dtype=dtype).log())
             if kind == "bell"
             else None
         )
-        # A linear function and its constant, or the constant alone.
+        # Linear coefficients and a constant, or only the constant.
         columns = inputs + 1 if order == 1 else 1
         self.consequents = nn.Parameter(
             torch.zeros(groups, outputs, self.rules, columns, dtype=dtype)
         )
-        # A valid partition from the start, before data place the sets.
+        # A valid partition from the start, before the sets are placed from data.
         self.init_grid(-1.0, 1.0)
 
     def extra_repr(self) -> str:
@@ -103,7 +103,7 @@ class Anfis(LinearOutputModule):
             Shape (*batch, groups, outputs).
         """
         columns = to_columns(x)
-        # (groups, outputs * columns, rules): one product blends all consequents.
+        # (groups, outputs * columns, rules): one matrix product blends all consequents.
         weights = self.consequents.transpose(2, 3).flatten(1, 2)
         blended = torch.bmm(weights, self.strength_columns(columns))
         if self.order == 1:
@@ -135,7 +135,7 @@ class Anfis(LinearOutputModule):
             width = widths[:, start : start + count]
             log_slopes = self.log_slopes
             if log_slopes is not None:
-                # As logarithms the trained numbers keep slopes and widths positive.
+                # Training their logarithms keeps slopes and widths positive.
                 slope = torch.exp(log_slopes[:, start : start + count]).unsqueeze(-1)
                 logs.append(log_bell(u, c, width, slope))
             else:
@@ -146,9 +146,9 @@ class Anfis(LinearOutputModule):
     def strength_columns(self, columns: Tensor) -> Tensor:
         """Normalised firing strengths, shape (groups, rules, samples).
 
-        They sum to 1 even where every rule underflows.
-        On a full grid the softmax of the summed log memberships is the product of one softmax for
-        each input: the same numbers with sum(terms) exponentials instead of prod(terms).
+        They sum to 1 even if every rule underflows.
+        On a full grid, the softmax of the summed log memberships equals the product of one softmax
+        per input, which needs sum(terms) exponentials instead of prod(terms).
         """
         shares = [torch.softmax(log, 1) for log in self._log_memberships(columns)]
         strengths = shares[0]
@@ -169,16 +169,16 @@ class Anfis(LinearOutputModule):
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """The regressors, then for each output Q h, Q h z and, for bells, Q dlog m / dlog b.
 
-        With normalised strengths s_r = prod_i p_i[t_i(r)] and rule outputs f_kr, the output y_k
-        moves with the log membership of set t of input i by
+        With normalised strengths s_r = prod_i p_i[t_i(r)] and rule outputs f_kr, the derivative of
+        the output y_k with respect to the log membership of set t of input i is
 
-            Q_kit = sum over the rules r that use the set of s_r f_kr - p_i[t] y_k,
+            Q_kit = (sum of s_r f_kr over the rules r that use the set) - p_i[t] y_k,
 
-        and the log memberships with z = (x - c)/a: by -h, where h = z for Gaussians.
+        and that of a log membership with respect to z = (x - c)/a is -h; h = z for Gaussians.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
-            out: of the result's shape; fresh memory costs more than the arithmetic.
+            out: buffer of the result's shape; allocating memory costs more than the arithmetic.
         Returns:
             Shape (groups, regressors + outputs * (2 or 3) sets, samples).
         """
@@ -189,7 +189,7 @@ class Anfis(LinearOutputModule):
         strengths, terms = self.strength_columns(u), self._terms(u)
         self._write_regressors(F[:, :shared], strengths, terms)
         z, h, by_slope = self._premises(u)
-        # The strengths' sums over the rules that use a set are the sets' shares p.
+        # Summing the strengths over the rules that use a set gives the set's share p.
         choice = torch.cartesian_prod(*(torch.arange(n) for n in self.terms))
         choice = choice.reshape(-1, len(self.terms))
         pairs = zip(choice.T, self.terms, strict=True)
@@ -208,17 +208,17 @@ class Anfis(LinearOutputModule):
 
     @torch.no_grad()
     def jacobian_maps(self) -> dict[str, Tensor]:
-        """By name of each trained parameter (groups, outputs, columns, entries of a group)."""
+        """Map of each trained parameter by name, (groups, outputs, columns, entries of a group)."""
         shared, own = self._column_counts
         output, regressor = (torch.eye(n).to(self.consequents) for n in (self.outputs, shared))
         blocks = {"consequents": (0, torch.einsum("ab,uv->aubv", output, regressor).flatten(2))}
         sets = {f"partition.{name}": rows for name, rows in self.partition.jacobian().items()}
         slopes = torch.eye(sum(self.terms)).to(output).expand(self.groups, -1, -1)
-        # d (centres, widths, slopes), of which each output has columns of its own.
+        # d (centres, widths, slopes); each output has its own columns of these.
         if self.log_slopes is not None:
             sets["log_slopes"] = torch.cat([torch.zeros_like(slopes).repeat(1, 2, 1), slopes], 1)
         for name, rows in sets.items():
-            # Gaussians have no columns for slopes, bells have.
+            # Bells have columns for slopes, Gaussians do not.
             padded = torch.nn.functional.pad(rows, (0, 0, 0, own - rows.shape[1]))
             block = torch.einsum("ab,gce->gabce", output, padded).flatten(2, 3)
             blocks[name] = shared, block
@@ -226,12 +226,12 @@ class Anfis(LinearOutputModule):
 
     def readout(self) -> Tensor:
         """The consequents as (groups, outputs, regressors)."""
-        # The regressors have the same order: rule by rule, inputs then 1.
+        # In the same order as the regressors: rule by rule, inputs then 1.
         return self.consequents.flatten(2)
 
     @property
     def _column_counts(self) -> tuple[int, int]:
-        """Shared columns of the consequents, and columns of the sets for each output."""
+        """Number of columns shared by all outputs, and of columns of the sets for each output."""
         shared = self.rules * self.consequents.shape[-1]
         return shared, (2 if self.log_slopes is None else 3) * sum(self.terms)
 
@@ -254,21 +254,21 @@ class Anfis(LinearOutputModule):
         slope = torch.exp(self.log_slopes).unsqueeze(-1)
         one = torch.ones_like(slope)
         outside = -slope * torch.expm1(log_bell(z, 0.0 * one, one, slope))
-        # The same hair above zero as in the membership.
+        # The same tiny offset from zero as in the membership.
         square = z * z + 1e-37
         return z, 2.0 * outside * z / square, -outside * square.log()
 
     def init_grid(self, lower: Range, upper: Range) -> None:
-        """Evenly spaced sets from `lower` to `upper`, neighbours crossing at 0.5.
+        """Evenly spaced sets from `lower` to `upper`, with neighbours crossing at 0.5.
 
-        Interpretable sets start a few percent off these, since their bounds are open.
+        Interpretable sets start a few percent off these, because their bounds are open intervals.
 
         Args:
             lower, upper: range of each input, broadcastable to (groups, inputs).
         """
         low, high = self._range(lower, upper)
         centres = even_centres(self.terms, low, high)
-        # Half-widths by which neighbours cross at 0.5 or more.
+        # Half-widths for which neighbours cross at 0.5 or more.
         half = torch.cat(crossing_half_widths(centres, high - low), 1)
         widths = half if self.kind == "bell" else half / HALF_WIDTH_OF_GAUSSIAN
         self.partition.assign(torch.cat(centres, 1), widths, low, high)
@@ -282,24 +282,24 @@ class Anfis(LinearOutputModule):
         lower: Range | None = None,
         upper: Range | None = None,
     ) -> None:
-        """Take given sets over, such as a controller's.
+        """Adopt given sets, such as those of a controller.
 
         Args:
-            centres: for each input the ascending centres, shape (terms,) or (groups, terms).
+            centres: ascending centres for each input, shape (terms,) or (groups, terms).
             widths: sigma of each Gaussian, or `a` of each bell; same shapes.
             slopes: `b` of each bell; same shapes.
-            lower, upper: range that interpretable sets must stay in; default the outer centres.
+            lower, upper: range in which interpretable sets must stay; default: the outer centres.
         """
         packed_centres = self._pack("centres", centres)
         packed_widths = self._pack("widths", widths)
-        # Their logarithms are stored.
+        # Because their logarithms are stored.
         if not bool((packed_widths > 0).all()):
             raise ValueError("`widths` must be positive.")
         pieces = packed_centres.split(self.terms, 1)
         low, high = self._range(
             torch.stack([c.amin(1) for c in pieces], 1) if lower is None else lower,
             torch.stack([c.amax(1) for c in pieces], 1) if upper is None else upper,
-            # Free sets ignore their range; one set alone has none.
+            # Free sets ignore their range; a single set has none.
             allow_equal=not self.interpretable,
         )
         self.partition.assign(packed_centres, packed_widths, low, high)
@@ -313,17 +313,17 @@ class Anfis(LinearOutputModule):
     def solve_consequents(
         self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6
     ) -> None:
-        """Set the consequents to the least-squares optimum for the present sets, in place.
+        """Set the consequents to the least-squares optimum for the current sets, in place.
 
         Args:
             x: inputs, shape (*batch, groups, inputs).
-            y: wanted outputs, shape (*batch, groups, outputs).
-            prior_precision: over the noise precision, a number or broadcastable to (groups,
-                rules * columns). The default is that of the recursive least squares of Jang's
-                paper, which starts from a covariance of 1e6. With 0, undetermined directions are
+            y: desired outputs, shape (*batch, groups, outputs).
+            prior_precision: relative to the noise precision, a number or broadcastable to (groups,
+                rules * columns). The default is that of the recursive least squares in Jang's
+                paper, which start from a covariance of 1e6. With 0, undetermined directions are
                 zero.
         Raises:
-            ValueError: no samples, or samples that are not finite.
+            ValueError: if there are no samples, or some are not finite.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.consequents[0, 0].numel())
         targets = y.reshape(-1, self.groups, self.outputs)

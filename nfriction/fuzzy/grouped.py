@@ -1,6 +1,6 @@
 """Layers of independent groups (joints): memory layout, input Jacobian, output layer.
 
-Layers take and give rows, (*batch, groups, size). Inside, samples run last, (groups, size,
+Layers take and return rows, (*batch, groups, size). Internally samples come last, (groups, size,
 samples), so that every kernel is vectorised over them.
 """
 
@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-# A block and its triangle then fit the cache.
+# A block and its triangle then fit into the cache.
 _ROWS_AT_ONCE = 8192
 
 
 def to_columns(x: Tensor) -> Tensor:
-    """(*batch, groups, size) → (groups, size, samples); scripts and exports."""
+    """(*batch, groups, size) → (groups, size, samples); can be scripted and exported."""
     return x.reshape(-1, x.shape[-2], x.shape[-1]).movedim(0, -1)
 
 
@@ -34,7 +34,7 @@ def input_range(
     """Bounds of every input, broadcast to `like` (groups, inputs).
 
     Raises:
-        ValueError: bounds that are not finite or do not ascend.
+        ValueError: if bounds are not finite or do not ascend.
     """
     low, high = (
         torch.as_tensor(end, dtype=like.dtype, device=like.device).expand_as(like)
@@ -57,7 +57,7 @@ class GroupedModule(nn.Module):
     outputs: int
 
     def input_jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by the inputs of its group.
+        """Derivative of every output with respect to the inputs of its group.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
@@ -66,36 +66,36 @@ class GroupedModule(nn.Module):
         """
         x = x.detach().requires_grad_()
         with torch.enable_grad():
-            # Samples do not mix, so the gradient of a sum holds the derivative of each.
+            # Samples are independent, so the gradient of their sum contains the derivative of each.
             sums = self(x).flatten(0, -2).sum(0)
             rows = [torch.autograd.grad(y, x, retain_graph=True)[0] for y in sums]
         return torch.stack(rows, 2).movedim(0, -1)
 
 
 class LinearOutputModule(GroupedModule):
-    """Layer that is linear in its regressors, with derivatives that its outputs share.
+    """Layer that is linear in its regressors, whose outputs share the columns of their derivatives.
 
-    The outputs share hidden units, so their derivatives combine fewer columns than there are
-    parameters. With F = jacobian_columns(x)[g] and M = jacobian_maps()[name][g, k],
+    The outputs share hidden units, so their derivatives are combinations of fewer columns than
+    there are parameters. With F = jacobian_columns(x)[g] and M = jacobian_maps()[name][g, k],
 
         d y_k(sample) / d parameter = F[:, sample] . M[:, parameter],
 
-    and least squares needs one product F F^T for all outputs, five times faster than a product of
-    whole Jacobians (`nfriction.papers.nffem.jacobian`). The first columns are the regressors, of
-    which `readout` makes the outputs.
+    and least squares needs one product F F^T for all outputs, which is five times faster than the
+    product of full Jacobians (`nfriction.papers.nffem.jacobian`). The first columns are the
+    regressors, from which `readout` computes the outputs.
     """
 
     @abstractmethod
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """Regressors (groups, regressors, samples) of x (samples, groups, inputs), in `out`."""
+        """Regressors (groups, regressors, samples) of x (samples, groups, inputs), into `out`."""
 
     @abstractmethod
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """Columns (groups, columns, samples) of x (samples, groups, inputs), in `out`."""
+        """Columns (groups, columns, samples) of x (samples, groups, inputs), into `out`."""
 
     @abstractmethod
     def jacobian_maps(self) -> dict[str, Tensor]:
-        """By name of each trained parameter (groups, outputs, columns, entries of a group)."""
+        """Map of each trained parameter by name, (groups, outputs, columns, entries of a group)."""
 
     @abstractmethod
     def readout(self) -> Tensor:
@@ -106,7 +106,7 @@ class LinearOutputModule(GroupedModule):
         return to_rows(self.regressor_columns(x.reshape(-1, *x.shape[-2:])), x)
 
     def _placed(self, blocks: Mapping[str, tuple[int, Tensor]], columns: int) -> dict[str, Tensor]:
-        """Maps of the trained parameters from their first columns and entries from there on."""
+        """Maps of the trained parameters, given the first column and the entries of each."""
         maps = {}
         for name, value in self.named_parameters():
             if value.requires_grad:
@@ -120,19 +120,19 @@ class LinearOutputModule(GroupedModule):
 def ridge(features: Tensor, targets: Tensor, prior_precision: float | Tensor) -> Tensor:
     """Minimiser of `|targets - features w|^2 + prior_precision |w|^2`.
 
-    The rows are reduced to a triangle by Householder QR, a block at a time, so that the condition
-    of the problem is not squared and memory does not grow with the samples. Directions that neither
-    data nor prior determine are zero (shortest solution).
+    The rows are reduced to a triangle by Householder QR, one block at a time, so that the condition
+    number is not squared and memory does not grow with the number of samples. Directions determined
+    by neither data nor prior are zero (minimum-norm solution).
 
     Args:
         features: shape (samples, groups, features).
         targets: shape (samples, groups, outputs).
-        prior_precision: not negative, a number or broadcastable to (groups, features); over the
-            noise precision, so that 1 weighs like one sample with unit feature.
+        prior_precision: not negative, a number or broadcastable to (groups, features); relative to
+            the noise precision, so that 1 has the weight of one sample with unit feature.
     Returns:
         Weights, shape (groups, features, outputs).
     Raises:
-        ValueError: no samples, samples that are not finite, or a negative precision.
+        ValueError: if there are no samples, some are not finite, or a precision is negative.
     References:
         Golub and Van Loan, Matrix Computations, 4th ed., sections 5.2 and 5.5.
     """
@@ -159,7 +159,7 @@ def ridge(features: Tensor, targets: Tensor, prior_precision: float | Tensor) ->
     # The prior adds rows whose targets are zero.
     rhs = torch.cat([rhs, rhs.new_zeros(groups, count, targets.shape[-1])], 1)
     U, singular, Vh = torch.linalg.svd(rows, full_matrices=False)
-    # Smaller singular values are rounding, and their inverse would be noise.
+    # Smaller singular values are round-off, and their inverses would be noise.
     floor = singular[:, :1] * count * torch.finfo(rows.dtype).eps
     inverse = torch.where(singular > floor, 1.0 / singular, torch.zeros_like(singular))
     return Vh.mT @ (inverse.unsqueeze(-1) * (U.mT @ rhs))

@@ -1,7 +1,7 @@
 """Fuzzy sets: membership functions, sets from printed ranges, and the sets of a network's rules.
 
-The functions work elementwise on tensors of any shape that broadcast, keep dtype and device, and
-script. Those that begin with `log_` stay finite where the membership itself underflows.
+The functions work elementwise on tensors that broadcast, keep dtype and device, and can be
+scripted. Functions named `log_...` stay finite where the membership itself underflows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 HALF_WIDTH_OF_GAUSSIAN = math.sqrt(2.0 * math.log(2.0))
-"""Half-width of a Gaussian set of sigma 1 where its membership is one half."""
+"""Half-width at half maximum of a Gaussian set with sigma 1."""
 
 
 def log_gaussian(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
@@ -34,15 +34,15 @@ def gaussian(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
 def log_bell(x: Tensor, centre: Tensor, width: Tensor, slope: Tensor) -> Tensor:
     """Logarithm of a generalised bell, `1 / (1 + |(x - centre)/width|^(2 slope))`.
 
-    It is differentiable at the centre too: the logarithm of z^2 is taken a hair above zero (1e-37,
-    which float32 can still hold).
+    It is also differentiable at the centre, because 1e-37 (which float32 can still represent) is
+    added to z^2 before its logarithm is taken.
     """
     z = (x - centre) / width
     return F.logsigmoid(-slope * torch.log(z * z + 1e-37))
 
 
 def bell(x: Tensor, centre: Tensor, width: Tensor, slope: Tensor) -> Tensor:
-    """Generalised bell membership, one half at `centre ± width`; `slope` sets the steepness there.
+    """Generalised bell membership, equal to 0.5 at `centre ± width`; `slope` sets the steepness.
 
     References:
         Jang (1993), ANFIS: Adaptive-Network-Based Fuzzy Inference System, eq. (11).
@@ -63,16 +63,16 @@ def right_shoulder(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
 def two_sided_gaussian(
     x: Tensor, left: Tensor, left_sigma: Tensor, right: Tensor, right_sigma: Tensor
 ) -> Tensor:
-    """Rising Gaussian up to `left`, falling Gaussian from `right`: their product.
+    """Product of a Gaussian that rises up to `left` and one that falls from `right`.
 
-    An infinite sigma removes that side, which makes shoulders of it.
+    An infinite sigma removes that side, which turns the set into a shoulder.
     """
     return right_shoulder(x, left, left_sigma) * left_shoulder(x, right, right_sigma)
 
 
 def trapezoid(x: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Membership that rises from a to b, is 1 up to c and falls to 0 at d; a = b is a cliff."""
-    # The comparisons are false for NaN, which so stays NaN.
+    """Membership that rises from a to b, is 1 up to c and falls to 0 at d; a = b makes a jump."""
+    # The comparisons are false for NaN, which therefore stays NaN.
     rising = torch.where(x >= b, torch.ones_like(x), (x - a) / (b - a).clamp(min=1e-37))
     falling = torch.where(x <= c, torch.ones_like(x), (d - x) / (d - c).clamp(min=1e-37))
     return torch.minimum(rising, falling).clamp(0.0, 1.0)
@@ -128,7 +128,7 @@ class FuzzySet:
 
     @property
     def core(self) -> float:
-        """Middle of where the set holds fully: the order of the terms is the order of these."""
+        """Middle of the interval in which the membership is 1; terms are ordered by it."""
         if self.shape in ("triangle", "trapezoid"):
             return 0.5 * (self.parameters[1] + self.parameters[-2])
         if self.shape == "two_sided_gaussian":
@@ -139,15 +139,15 @@ class FuzzySet:
 def sets_from_ranges(
     names: Sequence[str], ranges: Sequence[tuple[float, float]]
 ) -> tuple[FuzzySet, ...]:
-    """Gaussian sets from the range [low, high] that each of them spans.
+    """Gaussian sets from the range [low, high] of each.
 
-    A table of ranges leaves the shape open. Chosen here: an interior set is centred in its range
-    with sigma = range/4, so that it has fallen to 0.135 at the ends; the first and last sets are
-    shoulders at the outer end of their range with sigma = range/2, so that they fall to the same
-    0.135 at the inner end.
+    A table of ranges does not define the shape. The choice here: an interior set is centred in its
+    range with sigma = range/4, so that it has fallen to 0.135 at both ends; the first and last sets
+    are shoulders at the outer end of their range with sigma = range/2, so that they fall to the
+    same 0.135 at the inner end.
 
     Args:
-        names: one for each set, in ascending order of the values.
+        names: one per set, in ascending order of the values.
         ranges: (low, high) of each set; lows and highs both ascend.
     Raises:
         ValueError: if the ranges are empty, not finite, or do not ascend.
@@ -171,7 +171,7 @@ def sets_from_ranges(
         for name, (low, high) in spans
     ]
     (first, (low, high)), (last, (last_low, last_high)) = spans[0], spans[-1]
-    # The outermost sets hold fully beyond the universe, as "very fast" does.
+    # The outermost sets have membership 1 beyond the universe, as "very fast" should.
     sets[0] = FuzzySet(first, "left_shoulder", (low, (high - low) / 2))
     sets[-1] = FuzzySet(last, "right_shoulder", (last_high, (last_high - last_low) / 2))
     return tuple(sets)
@@ -184,9 +184,9 @@ class FuzzyRules:
     Attributes:
         lower, upper: trained range of both inputs, (joint, input).
         centres, widths: of the sets of each input, (joint, set) each.
-        coefficients: where both sets of a rule hold fully, (joint, rule, coefficient); the rules of
-            velocity's first set come first.
-        along_motion: whether acceleration is positive where the motion speeds up.
+        coefficients: of each rule, where the memberships of both of its sets are 1, (joint, rule,
+            coefficient); the rules of the first velocity set come first.
+        along_motion: whether acceleration is positive when the motion speeds up.
     """
 
     lower: Tensor
@@ -198,9 +198,9 @@ class FuzzyRules:
 
     @property
     def constant(self) -> bool:
-        """True if all rules of a joint have the same coefficients, as of a rejected network."""
+        """True if all rules of a joint have the same coefficients, as in a rejected network."""
         first = self.coefficients[:, :1].expand_as(self.coefficients)
-        # A network's sums round.
+        # The sums of a network have rounding errors.
         return torch.allclose(self.coefficients, first, rtol=1e-9, atol=0.0)
 
     def memberships(self, variable: int, joint: int, x: Tensor) -> Tensor:
@@ -212,10 +212,10 @@ class FuzzyRules:
     def seconds(self, step: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Time for which a motion fired each rule [s], (joint, rule).
 
-        A sample is shared out among the rules by their strengths.
+        Each sample is divided among the rules in proportion to their strengths.
 
         Args:
-            step: time that each sample counts for [s], (sample,).
+            step: duration represented by each sample [s], (sample,).
             qd, qdd: velocity and acceleration, (sample, joint).
         """
         along = qdd * qd.sign() if self.along_motion else qdd

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor, nn
 
 MIN_SPACING, MAX_SPACING = 0.25, 1.0
-"""Spacing of neighbouring centres over the sum of their half-widths. At 1 the sets cross at 0.5,
-at 0.25 (Gaussians) at 0.96, beyond which two words would mean the same."""
+"""Spacing of neighbouring centres relative to the sum of their half-widths. At 1 the sets cross at
+0.5; at 0.25 (Gaussians) at 0.96, above which two terms would mean the same."""
 
-# Place of a set alone in its range.
+# Relative position of a single set in its range.
 _MIDDLE = torch.tensor([0.5], dtype=torch.float64)
 
 
@@ -31,7 +31,7 @@ class FreePartition(nn.Module):
 
     @torch.no_grad()
     def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Take sets over, shape (groups, sets); the ranges are not needed."""
+        """Adopt sets of shape (groups, sets); the ranges are not needed."""
         self.centres.copy_(centres)
         self.log_widths.copy_(widths.log())
 
@@ -39,7 +39,7 @@ class FreePartition(nn.Module):
     def jacobian(self) -> dict[str, Tensor]:
         """d (centres, widths) / d parameter over the width, (groups, 2 sets, sets), by name.
 
-        Written out: the first automatic derivative of a process takes two seconds to load.
+        Written by hand, because the first use of autograd in a process takes two seconds to load.
         """
         inverse = torch.exp(-self.log_widths)
         zero = torch.zeros_like(inverse).diag_embed()
@@ -50,13 +50,13 @@ class FreePartition(nn.Module):
 
 
 class OrderedPartition(nn.Module):
-    """Sets that are ordered, inside their range and overlap at 0.5 or more, by construction.
+    """Sets that by construction are ordered, lie in their range and cross at 0.5 or more.
 
-    Free are the relative half-width h of each set (where its membership is one half) and, between
-    neighbours, the spacing s in (0.25, 1): centres lie s (h_t + h_{t+1}) apart, so some point
-    between them belongs to both at 0.5 at least. The first and last centres lie less than h inside
-    the range, so its ends belong to a set at 0.5 too. All lengths are scaled together to fill the
-    range. Every partition with these properties can be reached, and everything is smooth.
+    The free parameters are the relative half-width h of each set (where its membership is 0.5) and
+    the spacing s in (0.25, 1) of each pair of neighbours: centres lie s (h_t + h_{t+1}) apart, so
+    at some point between them both memberships are at least 0.5. The first and last centres lie
+    less than h inside the range, so at its ends a membership exceeds 0.5, too. All lengths are
+    scaled together to fill the range. All such partitions can be reached, and all maps are smooth.
 
     Parameters: `log_widths`, shape (groups, sets); `spacings`, shape (groups, sets + inputs): for
     each input the margin, the spacings between its sets, the other margin, as logits.
@@ -71,7 +71,7 @@ class OrderedPartition(nn.Module):
         super().__init__()
         self.terms = terms
         self.half_width = half_width  # of a set of width 1
-        # As attributes, for TorchScript sees no globals.
+        # Attributes, because TorchScript cannot read globals.
         self.least, self.span = MIN_SPACING, MAX_SPACING - MIN_SPACING
         sets, inputs = sum(terms), len(terms)
         self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
@@ -85,7 +85,7 @@ class OrderedPartition(nn.Module):
         widths: list[Tensor] = []
         start = 0
         for i, terms in enumerate(self.terms):
-            # Relative to the mean, so that only the shape of the partition counts.
+            # Relative to the mean, so that only the shape of the partition matters.
             logs = self.log_widths[:, start : start + terms]
             half = torch.exp(logs - logs.mean(1, keepdim=True))
             logits = self.spacings[:, start + i : start + i + terms + 1]
@@ -109,7 +109,7 @@ class OrderedPartition(nn.Module):
 
     @torch.no_grad()
     def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Take the nearest ordered partition over; bounds are kept by a margin of 2 %.
+        """Adopt the nearest ordered partition, with a margin of 2 % from the bounds.
 
         Args:
             centres, widths: shape (groups, sets).
@@ -122,7 +122,7 @@ class OrderedPartition(nn.Module):
             c = centres[:, start : start + terms]
             half = widths[:, start : start + terms] * self.half_width
             spacing = c.diff(dim=1) / (half[:, :-1] + half[:, 1:])
-            # The inverse of `forward`: margins and spacings as shares of their open intervals.
+            # The inverse of `forward`: margins and spacings as fractions of their open intervals.
             share = torch.cat(
                 [
                     (c[:, :1] - self.lower[:, i : i + 1]) / half[:, :1],
@@ -145,12 +145,12 @@ class OrderedPartition(nn.Module):
 
         found = torch.func.jacrev(sets)(parameters)
         widths = self()[1].repeat(1, 2).unsqueeze(-1)
-        # A group's sets depend on its own parameters only.
+        # The sets of a group depend only on its own parameters.
         return {n: J.diagonal(dim1=0, dim2=2).movedim(-1, 0) / widths for n, J in found.items()}
 
 
 def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]:
-    """Centres from `lower` to `upper` (groups, inputs); for each input (groups, terms)."""
+    """Centres from `lower` to `upper` (groups, inputs); one tensor (groups, terms) per input."""
     centres = []
     for i, count in enumerate(terms):
         low, span = lower[:, i, None], (upper - lower)[:, i, None]
@@ -160,11 +160,11 @@ def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]
 
 
 def crossing_half_widths(centres: list[Tensor], span: Tensor) -> list[Tensor]:
-    """Half-widths by which neighbours overlap at 0.5 or more: half of the wider adjacent gap.
+    """Half-widths for which neighbours cross at 0.5 or more: half of the wider adjacent gap.
 
     Args:
         centres: for each input, ascending, shape (groups, terms).
-        span: of each input (groups, inputs); a set alone gets half of it.
+        span: of each input (groups, inputs); a single set gets half of it.
     """
     half_widths = []
     for i, c in enumerate(centres):

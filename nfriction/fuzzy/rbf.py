@@ -16,32 +16,32 @@ from nfriction.fuzzy.grouped import (
     to_rows,
 )
 
-# Orthogonal least squares takes so many evenly thinned candidates and samples.
+# Numbers of evenly thinned candidates and samples for orthogonal least squares.
 _CANDIDATES, _SAMPLES = 500, 5000
 
 
 class RBFNetwork(LinearOutputModule):
-    """Gaussian units with a width per axis and a linear output layer, groups stacked.
+    """Gaussian units with one width per axis and a linear output layer, with groups stacked.
 
-    `y = output_weight · exp(-Σ_i ((x_i - c_i)/s_i)^2 / 2) + output_bias`. A fresh network has its
+    `y = output_weight · exp(-Σ_i ((x_i - c_i)/s_i)^2 / 2) + output_bias`. A new network has
     centres drawn from [-1, 1] and small random output weights; `init_kmeans` or `init_ols` place
-    the centres by the data, `solve_output` gives the best output layer for them.
+    the centres using data, and `solve_output` finds the best output layer for them.
 
     Parameters: `centres` and `log_widths` (groups, units, inputs), `output_weight` (groups,
     outputs, units), `output_bias` (groups, outputs).
 
     Args:
-        groups: independent networks of the same shape, e.g. one a joint.
+        groups: independent networks of the same shape, e.g. one per joint.
         inputs, units, outputs: the paper's network is 2-10-2.
-        seed: of the fresh centres and weights.
+        seed: for the initial centres and weights.
 
     References:
         Moody and Darken (1989), Fast learning in networks of locally-tuned processing units.
         TLRIP paper, section on the neuro-fuzzy models (2-10-2).
     """
 
-    # A unit 24 widths away gives 5e-131, nearly nothing. Numbers that underflow would cost fifty
-    # times the arithmetic, in the exponential and again in every product.
+    # A unit 24 widths away returns 5e-131, practically zero. Numbers that underflow
+    # would make the exponential and every later product fifty times slower.
     least_exponent: Final[float] = -300.0
 
     def __init__(
@@ -65,7 +65,7 @@ class RBFNetwork(LinearOutputModule):
         weight = torch.randn(groups, outputs, units, generator=random, dtype=dtype)
         self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
         self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
-        # Small, so that a fresh network is nearly flat; not zero, where centres have no gradient.
+        # Small, so that a new network is nearly flat; with zero, centres would have no gradient.
         self.output_weight = nn.Parameter(0.1 * weight)
         self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=dtype))
         self.init_range(-1.0, 1.0, seed)
@@ -91,7 +91,7 @@ class RBFNetwork(LinearOutputModule):
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
-        # In place all through: these arrays are the largest of a fit.
+        # Always in place: these are the largest arrays of a fit.
         phi = torch.baddbmm(constant, quadratic, powers, out=out[:, :-1])
         phi.clamp_(min=self.least_exponent).exp_()
         out[:, -1] = 1.0
@@ -103,7 +103,7 @@ class RBFNetwork(LinearOutputModule):
 
         Args:
             x: inputs, shape (samples, groups, inputs).
-            out: of the result's shape; fresh memory costs more than the arithmetic.
+            out: buffer of the result's shape; allocating memory costs more than the arithmetic.
         Returns:
             Shape (groups, units + 1 + 2 units inputs, samples).
         """
@@ -113,7 +113,7 @@ class RBFNetwork(LinearOutputModule):
         moving = F[:, shared:].unflatten(1, (2, self.units, self.inputs))
         d = torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=moving[:, 0])
         squares = torch.mul(d, d, out=moving[:, 1])
-        # The exponents need nothing but these differences.
+        # The exponents need only these differences.
         factor = -0.5 * torch.exp(-2.0 * self.log_widths).unsqueeze(-1)
         phi = torch.mul(squares[:, :, 0], factor[:, :, 0], out=F[:, : self.units])
         for i in range(1, self.inputs):
@@ -144,23 +144,23 @@ class RBFNetwork(LinearOutputModule):
         return self._placed(blocks, columns)
 
     def _activations(self, x: Tensor) -> Tensor:
-        """Units' outputs, shape (groups, units, samples)."""
+        """Outputs of the units, shape (groups, units, samples)."""
         constant, quadratic, powers = self._expanded(x)
         exponents = torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
         return torch.exp(exponents)
 
     def _expanded(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Constants, coefficients and powers of the inputs: the exponents as a product.
+        """Constants, coefficients and powers of the inputs, whose product gives the exponents.
 
-        The square is expanded into a product of matrices, 12 times faster on 40,000 samples than
-        differences of every sample and centre. Taken about the mean centre it costs digits only by
-        (range/width)^2, never by where the inputs lie.
+        Expanding the square into a product of matrices is 12 times faster on 40,000 samples than
+        differences of every sample and centre. Expanded about the mean centre, the loss of digits
+        depends only on (range/width)^2, not on the location of the inputs.
 
         Returns:
             Shapes (groups, units, 1), (groups, units, 2 inputs) and (groups, 2 inputs, samples).
         """
         columns = to_columns(x)
-        # Expanding about zero would cancel digits where inputs lie far from it.
+        # Expanding about zero would cancel digits for inputs far from it.
         middle = self.centres.mean(1)
         offset = self.centres - middle.unsqueeze(1)
         v = columns - middle.unsqueeze(-1)
@@ -172,11 +172,11 @@ class RBFNetwork(LinearOutputModule):
 
     @torch.no_grad()
     def init_range(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
-        """Centres drawn from a range, widths half of it.
+        """Draw the centres from a range and set the widths to half of it.
 
         Args:
             lower, upper: range of each input, broadcastable to (groups, inputs).
-            seed: of the draw.
+            seed: of the random draw.
         """
         low, high = input_range(lower, upper, self.centres[:, 0].detach())
         low, span = low.unsqueeze(1), (high - low).unsqueeze(1)
@@ -187,7 +187,7 @@ class RBFNetwork(LinearOutputModule):
 
     @torch.no_grad()
     def init_kmeans(self, x: Tensor, seed: int = 0) -> None:
-        """Centres by k-means; widths twice the mean distance to the two nearest centres.
+        """Place centres by k-means; widths are twice the mean distance to the two nearest centres.
 
         Args:
             x: samples, shape (*batch, groups, inputs).
@@ -201,12 +201,12 @@ class RBFNetwork(LinearOutputModule):
 
     @torch.no_grad()
     def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
-        """Centres by orthogonal least squares: greedily those samples that explain most of `y`.
+        """Place centres by orthogonal least squares: greedily at the samples that explain `y` best.
 
         Args:
             x: inputs, shape (*batch, groups, inputs).
-            y: wanted outputs, shape (*batch, groups, outputs).
-            width: of every unit, over the standard deviation of each input.
+            y: desired outputs, shape (*batch, groups, outputs).
+            width: of every unit, relative to the standard deviation of each input.
         """
         samples = self._samples(x)
         targets = y.reshape(-1, self.groups, self.outputs)
@@ -218,12 +218,12 @@ class RBFNetwork(LinearOutputModule):
 
     @torch.no_grad()
     def solve_output(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
-        """Set weights and bias to the least-squares optimum for the present units, in place.
+        """Set weights and bias to the least-squares optimum for the current units, in place.
 
         Args:
             x: inputs, shape (*batch, groups, inputs).
-            y: wanted outputs, shape (*batch, groups, outputs).
-            prior_precision: over the noise precision; a number or broadcastable to (groups,
+            y: desired outputs, shape (*batch, groups, outputs).
+            prior_precision: relative to the noise precision; a number or broadcastable to (groups,
                 units + 1).
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
@@ -246,12 +246,12 @@ class RBFNetwork(LinearOutputModule):
 class AnfisRBF(GroupedModule):
     """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
 
-    The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
+    The ANFIS provides the main fit and the head refines it; the output of a new head is zero.
 
     Args:
         groups, inputs, terms, outputs: of the layer, see `Anfis`.
         units: of the head.
-        seed: of the head's fresh centres.
+        seed: for the initial centres of the head.
         options: of the layer: order, kind, interpretable, dtype.
     """
 
@@ -271,7 +271,7 @@ class AnfisRBF(GroupedModule):
         self.anfis = Anfis(groups, inputs, terms, outputs, **options)
         dtype = self.anfis.consequents.dtype
         self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
-        # A fresh head changes nothing.
+        # A new head changes nothing.
         nn.init.zeros_(self.head.output_weight)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -280,7 +280,7 @@ class AnfisRBF(GroupedModule):
         return y + self.head(torch.cat([x, y], -1))
 
     def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
-        """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
+        """Spread the sets evenly over the range, and draw the head's centres from it (outputs: ±1).
 
         Args:
             lower, upper: range of each input, broadcastable to (groups, inputs).
@@ -294,22 +294,22 @@ class AnfisRBF(GroupedModule):
 
     @torch.no_grad()
     def init_head(self, x: Tensor, seed: int = 0) -> None:
-        """Place the head's units by the samples `x`; its output layer stays unchanged."""
+        """Place the head's units using the samples `x`; its output layer stays unchanged."""
         self.head.init_kmeans(torch.cat([x, self.anfis(x)], -1), seed)
 
     @torch.no_grad()
     def solve_head(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
-        """Least squares of the head's output layer on the ANFIS's residual of `y`."""
+        """Fit the head's output layer to the ANFIS's residual of `y` by least squares."""
         carried = self.anfis(x)
         # On the residual, so that the rules keep their meaning.
         self.head.solve_output(torch.cat([x, carried], -1), y - carried, prior_precision)
 
 
 def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
-    """Centres of `units` clusters, shape (units, inputs), inputs weighed by their deviation."""
-    from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
+    """Centres of `units` clusters, shape (units, inputs), inputs scaled by their deviation."""
+    from scipy.cluster.vq import kmeans2  # slow to import and rarely needed
 
-    # k-means is not invariant to the units of its inputs.
+    # k-means depends on the units of its inputs.
     scale = samples.std(0)
     centres, _ = kmeans2((samples / scale).cpu().numpy(), units, iter=50, minit="++", seed=seed)
     return torch.as_tensor(centres).to(samples) * scale
@@ -324,14 +324,14 @@ def _nearest_spread(centres: Tensor, samples: Tensor) -> Tensor:
     if len(centres) == 1:
         return 2 * scale.expand_as(centres)
     distance = torch.cdist(centres / scale, centres / scale)
-    # The smallest distance is that of a centre to itself.
+    # The smallest distance is that from a centre to itself.
     spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
-    # Two centres may coincide, where k-means had too few different samples.
+    # Two centres may coincide if k-means had too few distinct samples.
     return 2 * spread.clamp(min=1e-3) * scale
 
 
 def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> Tensor:
-    """Samples chosen one by one so that each explains the most of the targets' residual.
+    """Samples chosen one by one, each explaining as much of the targets' residual as possible.
 
     References:
         Chen, Cowan and Grant (1991), Orthogonal least squares learning algorithm for radial basis
@@ -348,7 +348,7 @@ def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> T
     for _ in range(units):
         energy = (columns**2).sum(0)
         gain = ((columns.T @ left) ** 2).sum(1) / energy.clamp(min=torch.finfo(left.dtype).tiny)
-        # The rest of a direction that the chosen units span is rounding noise.
+        # If the chosen units already span a direction, its remainder is round-off.
         gain[energy < 1e-10 * power] = -1.0
         gain[chosen] = -2.0
         best = int(gain.argmax())
@@ -362,6 +362,6 @@ def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> T
 def _thin(rows: Tensor, most: int) -> Tensor:
     if len(rows) <= most:
         return rows
-    # Evenly over the recording, whose first seconds may be rest.
+    # Spread over the whole recording, since it may begin at rest.
     picks = torch.linspace(0, len(rows) - 1, most, dtype=torch.float64, device=rows.device)
     return rows[picks.round().long()]

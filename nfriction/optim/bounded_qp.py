@@ -1,4 +1,4 @@
-"""Convex quadratic minimisation within bounds, and positive semidefinite systems."""
+"""Convex quadratic minimisation within bounds, and solvers of positive semidefinite systems."""
 
 import math
 from collections.abc import Callable
@@ -6,59 +6,59 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-# Fewer blocks than this are solved as fast in one piece.
+# With fewer blocks than this, a dense solution is as fast.
 MANY_BLOCKS = 100
 
 
 def solve_free(
     matrix: Tensor, right: Tensor, free: Tensor, blocks: tuple[int, int] | None
 ) -> Tensor:
-    """Solve for the free variables of a positive semidefinite system, by blocks if it has many.
+    """Solve a positive semidefinite system for its free variables, by blocks if there are many.
 
     Args:
         matrix: rows and columns of the free variables, (p, p).
         right: right sides, (p,) or (p, k).
-        free: those among all variables, bool (variables,).
+        free: mask of these among all variables, bool (variables,).
         blocks: of the matrix of all variables, see `least_squares.Quadratic`.
     """
     if blocks is not None:
         first, size = blocks
-        # A block that has lost a variable would have another size.
+        # A block with a fixed variable would have a different size.
         if len(free) - first >= MANY_BLOCKS * size and free[first:].all():
             return solve_arrowhead(matrix, right, int(free[:first].sum()), size)
     return solve_semidefinite(matrix, right)
 
 
 def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve a positive semidefinite system; the shortest solution of a singular one.
+    """Solve a positive semidefinite system; the minimum-norm solution if it is singular.
 
     Args:
         matrix: (p, p).
         right: right sides, (p,) or (p, k); the solutions have its shape.
     """
     sides = right if right.ndim == 2 else right[:, None]
-    # Half the work of an LU factorisation, and no exception where it fails.
+    # Half the work of an LU factorisation, and no exception if it fails.
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if not failed:
         solution = torch.cholesky_solve(sides, factor)
         if torch.isfinite(solution).all():
             return solution.view_as(right)
     values, vectors = torch.linalg.eigh(matrix)
-    # Smaller eigenvalues are rounding: their directions stay where they are.
+    # Smaller eigenvalues are round-off; the solution is zero along their eigenvectors.
     cut = torch.finfo(matrix.dtype).eps * len(values) * values.abs().max()
     inverse = torch.where(values > cut, 1 / values, 0.0)
     return (vectors @ (inverse[:, None] * (vectors.T @ sides))).view_as(right)
 
 
 def solve_arrowhead(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
-    """Solve a system that is block diagonal from some row on, by its Schur complement.
+    """Solve a system that is block diagonal from some row onward, by its Schur complement.
 
     The cost grows linearly with the number of blocks instead of with its cube.
 
     Args:
         matrix: symmetric, (p, p).
         right: right sides, (p,) or (p, k).
-        first: row from which on the matrix is block diagonal.
+        first: row from which the matrix is block diagonal.
         size: of each block.
     """
     count = (len(matrix) - first) // size
@@ -88,14 +88,14 @@ APART = 400
 # A parameter within this many round-off units of a bound is on it.
 NEAR = 4
 
-# (matrix, right sides, which variables these are) -> solutions.
+# (matrix, right sides, mask of these variables) -> solutions.
 Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def as_bounds(
     x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Both bounds in the shape of `x0`; infinite if there is none.
+    """Both bounds in the shape of `x0`; infinite where there is none.
 
     Raises:
         ValueError: if a shape does not fit, or a lower bound exceeds the upper one.
@@ -114,7 +114,7 @@ def as_bounds(
 
 
 def snap_to_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor:
-    """Clamp to the bounds, and to a bound within round-off of the step from `before`."""
+    """Clamp to the bounds, and snap to a bound within round-off of the step from `before`."""
     near = NEAR * torch.finfo(x.dtype).eps
     for bound, inside in ((lower, x - lower), (upper, upper - x)):
         there = bound.isfinite() & (inside <= near * torch.maximum(bound.abs(), before.abs()))
@@ -127,7 +127,7 @@ def minimise(
 ) -> Tensor:
     """Minimiser of `slope @ x + x @ system @ x / 2` within `low <= 0 <= high`, by an active set.
 
-    From zero it moves toward the minimiser over the free variables up to the first bound, which
+    Each step goes toward the minimiser over the free variables, up to the first bound, which
     becomes active; at a minimum, the active bound with the most negative multiplier is released.
     Activating all violated bounds at once can stop short of the minimum when variables are
     correlated.
@@ -135,8 +135,8 @@ def minimise(
     Args:
         system: positive semidefinite, (p, p).
         slope, low, high: (p,); bounds may be infinite.
-        free: initially free variables, bool (p,); the rest is at a bound.
-        solve: (matrix, right sides, free) -> solutions over the free ones; one or several.
+        free: initially free variables, bool (p,); the others are at a bound.
+        solve: (matrix, right sides, free) -> solutions for the free variables; one or several.
 
     References:
         J. Nocedal, S. J. Wright, Numerical Optimization (2006), algorithm 16.3.
@@ -148,7 +148,7 @@ def minimise(
     loose = low.isinf() & high.isinf()
     if loose.all() or int(loose.sum()) < APART:
         return _active_set(system, slope, low, high, free, solve)
-    # Unbounded variables follow the others, and are eliminated once.
+    # Unbounded variables are functions of the others, so they are eliminated once.
     tight = ~loose
     right = torch.cat([system[loose][:, tight], slope[loose, None]], 1)
     following = solve(system[loose][:, loose], right, loose)
@@ -182,13 +182,13 @@ def _active_set(
         inward &= pull.abs() > rounding * (slope.abs() + system.abs() @ x.abs())
         if not inward.any():
             break
-        # One at a time, because afterwards the others may no longer pull inward.
+        # One at a time, because the other gradients may no longer point inward afterwards.
         free[torch.where(inward, pull.abs(), -1.0).argmax()] = True
     return x
 
 
 def _towards(x: Tensor, target: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """As far towards a target as the bounds allow, and the bounds that stop it, bool."""
+    """The point as far towards a target as the bounds allow, and the bounds it hits, bool."""
     move = target - x
     share = torch.where(move > 0, high - x, low - x) / move
     share = torch.where(move == 0, torch.inf, share)
@@ -197,5 +197,5 @@ def _towards(x: Tensor, target: Tensor, low: Tensor, high: Tensor) -> tuple[Tens
         return target, torch.zeros_like(move, dtype=torch.bool)
     hit = share <= least
     reached = torch.where(hit, torch.where(move > 0, high, low), x + least * move)
-    # Round-off may pass a bound that was not the nearest.
+    # Because of round-off, the step may cross a bound that was not the nearest.
     return reached.clamp(low, high), hit

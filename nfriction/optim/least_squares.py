@@ -1,4 +1,4 @@
-"""Local quadratic models of least-squares problems, and the result of minimising one."""
+"""Local quadratic models of least-squares problems, and the result of a minimisation."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Quadratic:
         cost: half the sum of squared residuals.
         gradient: J^T r, shape (p,).
         hessian: Gauss-Newton J^T J (or any positive semidefinite curvature), shape (p, p).
-        blocks: if the Hessian's last part is block diagonal, its first row and the blocks' size.
+        blocks: first row and block size of the block-diagonal last part of the Hessian, if any.
     """
 
     cost: float | Tensor
@@ -73,7 +73,7 @@ class Quadratic:
 
 
 class Step(NamedTuple):
-    """An accepted step: cost after it, its damping, norm of the scaled step.
+    """An accepted step: cost after it, its damping, and norm of the scaled step.
 
     `step_norm` is measured in residual units (each parameter times the norm of its Jacobian
     column), so it does not depend on the parameters' units.
@@ -93,7 +93,7 @@ class LeastSquaresResult:
         cost: half the sum of squares at `x`.
         gradient: at `x`, shape (p,), not projected.
         hessian: Gauss-Newton Hessian at `x`, shape (p, p).
-        status: reason why the search ended; `message` is the same in words.
+        status: reason why the search ended; `message` describes it in words.
         steps: accepted steps.
         evaluations: costs evaluated, including rejected trials.
         at_lower, at_upper: which parameters lie on a bound, shape (p,), bool.
@@ -123,7 +123,7 @@ class LeastSquaresResult:
 
 
 def positive_diagonal(diagonal: Tensor) -> Tensor:
-    """1 in place of zeros, since the scale of a parameter without influence is arbitrary."""
+    """Replace zeros by 1, since the scale of a parameter without influence is arbitrary."""
     return torch.where(diagonal > 0, diagonal, 1.0)
 
 

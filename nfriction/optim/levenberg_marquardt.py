@@ -1,15 +1,15 @@
-"""Levenberg-Marquardt on a local quadratic model, with bounds and the reason for its end.
+"""Levenberg-Marquardt on a local quadratic model, with bounds and a reason for termination.
 
 Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient g = J^T r and its
 Gauss-Newton Hessian H = J^T J. One iteration
 
 1. minimises g^T p + 1/2 p^T (H + damping D) p within the bounds, with D the largest diagonal of H
-   so far: a strong damping keeps the step p short;
-2. evaluates the cost at x + p, and takes the step only if the cost falls;
+   so far: strong damping keeps the step p short;
+2. evaluates the cost at x + p, and accepts the step only if the cost falls;
 3. lowers the damping if the quadratic predicted the decrease well, and raises it otherwise.
 
-The solver needs cost, gradient and Hessian, but not the Jacobian of the residuals, so that callers
-can sum 40,000 samples in pieces without storing it. The next step is `nfriction.evaluation.score`.
+The solver needs cost, gradient and Hessian, but not the Jacobian of the residuals, so callers can
+sum over 40,000 samples in chunks without storing it. The next step is `nfriction.evaluation.score`.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from nfriction.optim.least_squares import (
 
 Model = Callable[[Tensor], Quadratic]
 Cost = Callable[[Tensor], Tensor]
-# (x, its quadratic, the step that led there) -> a status that ends the search, or None.
+# (x, its quadratic, the step to x) -> a status that ends the search, or None.
 Callback = Callable[[Tensor, Quadratic, Step], Status | None]
 
-# Damping is relative to the (unit) scaled diagonal. Below the least, it no longer keeps round-off
-# from drifting along a singular direction; a rejected step raises it at least to the level at which
-# it matters; beyond the largest, a step is lost in round-off.
+# Damping is relative to the (unit) scaled diagonal. Below the smallest value it no longer prevents
+# drift by round-off along a singular direction; a rejected step raises it at least to the level at
+# which it matters; above the largest value a step is lost in round-off.
 LEAST_DAMPING, FELT_DAMPING, LARGEST_DAMPING = 1e-16, 1e-8, 1e16
-# Up to this damping a short step indicates a minimum, beyond it only strong damping.
+# Up to this damping a short step indicates a minimum; above it, only that the damping is strong.
 WEAK_DAMPING = 1.0
 # Factor after a rejected or poor step, divisor after a good one.
 RAISE, LOWER = 4.0, 6.0
@@ -51,12 +51,12 @@ RAISE, LOWER = 4.0, 6.0
 class LevenbergMarquardt:
     """Damped Gauss-Newton minimiser of 1/2 sum r^2 within bounds.
 
-    All tests are made in units of D, so that a fit does not depend on the units of its parameters.
+    All tests use units of D, so that a fit does not depend on the units of its parameters.
 
     Args:
-        max_steps: limit of accepted steps.
+        max_steps: limit on accepted steps.
         gradient_tolerance: largest cosine between the residual and a free Jacobian column.
-        cost_tolerance: relative decrease of the cost, predicted and actual, that counts as zero.
+        cost_tolerance: relative decrease of the cost (predicted and actual) that counts as zero.
         step_tolerance: ratio of step to parameters, both scaled, that counts as zero.
         initial_damping: relative to D; 0 tries a pure Gauss-Newton step first.
     References:
@@ -87,14 +87,14 @@ class LevenbergMarquardt:
         upper: Tensor | float | None = None,
         callback: Callback | None = None,
     ) -> LeastSquaresResult:
-        """Minimise from `x0`; never raises for a bad region, an interrupt or non-convergence.
+        """Minimise from `x0`; does not raise for a bad region, an interrupt or non-convergence.
 
         A trial whose cost or derivatives are not finite is a rejected step.
 
         Args:
             model: local quadratic at x.
-            x0: start, shape (p,); projected into the bounds.
-            cost: half the sum of squares alone, for trial steps, if cheaper than `model`.
+            x0: start, shape (p,); projected onto the bounds.
+            cost: only half the sum of squares, for trial steps, if cheaper than `model`.
             lower, upper: bounds, shape (p,) or a number; infinite entries are unbounded.
             callback: called after each accepted step; may end the search with a status.
         Returns:
@@ -130,7 +130,7 @@ class LevenbergMarquardt:
         # The square of the relative round-off of the residuals.
         vanished = state.cost * torch.finfo(state.x.dtype).eps ** 2
         while True:
-            # The running maximum keeps a parameter's scale even if its influence vanishes on the
+            # The running maximum keeps a parameter's scale even if its influence vanishes along the
             # way.
             state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
             if state.cost <= vanished or state.gradient_cosine() <= self.gradient_tolerance:
@@ -144,7 +144,7 @@ class LevenbergMarquardt:
                 return ended
 
     def _advance(self, state: _State, model: Model, cost: Cost | None) -> Status | None:
-        """Take one step that lowers the cost, raising the damping until there is one."""
+        """Take one step that lowers the cost, raising the damping until one does."""
         root = positive_diagonal(state.scale).sqrt()
         while True:
             step = state.damped_step(root)
@@ -163,7 +163,7 @@ class LevenbergMarquardt:
                 elif gain < 0.25:
                     state.raise_damping()
                 return "converged_cost" if flat else "converged_step" if short else None
-            # A step into a region without finite cost is not evidence, however short.
+            # A step into a region without finite cost proves nothing, however short.
             if short and math.isfinite(decrease):
                 return "converged_step"
             if flat:
@@ -185,7 +185,7 @@ class _State:
     history: list[Step] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        # Unknown until the first evaluation; an interrupt in it must still return a result.
+        # Unknown until the first evaluation; an interrupt during it must still return a result.
         unknown = self.x.new_full((len(self.x), len(self.x)), torch.nan)
         self.local = Quadratic(math.inf, self.x.new_full(self.x.shape, torch.nan), unknown)
         self.scale = torch.zeros_like(self.x)
@@ -198,7 +198,7 @@ class _State:
         self.damping = max(self.damping * RAISE, FELT_DAMPING)
 
     def frozen(self) -> Tensor:
-        """Parameters that the gradient pushes against their bound, bool (p,)."""
+        """Parameters that the descent direction pushes against their bound, bool (p,)."""
         slope = self.local.gradient
         return ((self.x <= self.lower) & (slope > 0)) | ((self.x >= self.upper) & (slope < 0))
 
@@ -210,7 +210,7 @@ class _State:
         return float(cosines.max()) if len(cosines) else 0.0
 
     def damped_step(self, root: Tensor) -> Tensor:
-        """Minimiser of the damped quadratic within the bounds, in parameters scaled by `root`."""
+        """Minimiser of the damped quadratic within the bounds, solved in units of `root`."""
         system = self.local.hessian / (root[:, None] * root)
         system.diagonal().add_(self.damping)
         low, high = (self.lower - self.x) * root, (self.upper - self.x) * root
@@ -219,7 +219,7 @@ class _State:
         return bounded_qp.minimise(system, slope, low, high, ~self.frozen(), solve) / root
 
     def attempt(self, step: Tensor, length: float, model: Model, cost: Cost | None) -> float:
-        """Move if the cost decreases and all is finite; return the decrease, or -inf."""
+        """Move if the cost decreases and everything is finite; return the decrease, or -inf."""
         # A parameter within round-off of its bound would never count as frozen.
         trial = bounded_qp.snap_to_bounds(self.x + step, self.lower, self.upper, self.x)
         self.evaluations += 1

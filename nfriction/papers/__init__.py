@@ -1,1 +1,1 @@
-"""The two papers' own methods; nothing of the core imports them."""
+"""The two papers' own methods; the core does not import them."""

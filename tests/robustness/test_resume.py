@@ -162,7 +162,7 @@ def test_ctrl_c_ends_with_what_was_reached_and_says_where(tmp_path: Path) -> Non
         time.sleep(0.01)
     told = end(process, signal.SIGINT)
     assert process.returncode == 130, told
-    assert f"what was reached is in {folder}" in told
+    assert f"progress is saved in {folder}" in told
     assert "Traceback" not in told
     assert state.exists()
     assert not [p for p in folder.rglob("*") if p.suffix == ".part"]

@@ -115,7 +115,7 @@ def test_networks_are_trained_on_the_supervised_set(
     if adaptive is not None:
         words += ["--adaptive", str(save(adaptive, tmp_path / "adaptive.json"))]
     train("train_supervised.py", *words)
-    assert "3000 samples a joint, 3 units" in capsys.readouterr().out
+    assert "3000 samples per joint, 3 units" in capsys.readouterr().out
     model = load(tmp_path / f"{made}.json")
     # The network follows the controllers: it is not the constant that it started from.
     speeds = torch.tensor([[0.1] * 3, [3.0] * 3], dtype=torch.float64)

@@ -1,1 +1,1 @@
-"""Order of searches: horizons, starts, hold-out."""
+"""Fitting strategies: order of horizons and starts, and hold-out validation."""

@@ -1,6 +1,6 @@
-"""Constant coefficients: regression on torques first, then shooting windows of growing length.
+"""Constant coefficients: first regression on torques, then shooting windows of growing length.
 
-A nonlinear law has several starts: its own, and two from its nested law.
+A nonlinear law is fitted from several starts: its own, and two from its nested law.
 """
 
 import math
@@ -48,7 +48,7 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
 
-# Causes of skipped windows that a user can remove.
+# Causes of skipped windows that a user can eliminate.
 SKIPPED = {
     "too long": "the motion forgets its start within them, or law or plant are wrong",
     "lossy": (
@@ -95,7 +95,7 @@ def fit_constant(task: FitTask) -> FitResult:
             (by_torque.coefficients.reshape(-1), plant), task.motions, equation_error,
         )  # fmt: skip
     found = search.end
-    # Terms that few rigs need come last, since they can absorb friction that is not yet fitted.
+    # Terms that few rigs need come last, since they could absorb friction that is not yet fitted.
     undecided = start is None and options.eccentricity == "auto" and options.fit_plant
     if undecided and isinstance(task.plant, PendulumChain) and not found.stopped:
         richer = _fitter(task, model, torque, eccentric=True)
@@ -152,7 +152,7 @@ def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[
 
 
 def constant_start(task: FitTask) -> FitResult:
-    """The constant fit of a model's law; `task.start` if it is one to the same recordings."""
+    """The constant fit of a model's law; `task.start` if it is such a fit to these recordings."""
     model, start = task.model, task.start
     if is_constant_fit(start, model) and _offsets_match(start, task):
         return start
@@ -161,7 +161,7 @@ def constant_start(task: FitTask) -> FitResult:
 
 
 def _offsets_match(start: FitResult, task: FitTask) -> bool:
-    """True if a fit has encoder offsets of exactly these recordings, or correctly none."""
+    """True if a fit has encoder offsets for exactly these recordings, or has and needs none."""
     if not task.per_recording:
         return not start.encoder_offsets
     pairs = zip(start.motions, task.motions, strict=False)
@@ -177,11 +177,11 @@ def warm_start_from_nested(
     motions: tuple[Motion, ...],
     equation_error: EquationError,
 ) -> Continuation:
-    """The lowest end of a law, also searched from its nested law, unless that makes it worse.
+    """The better search of a law: its own, or the one from its nested law unless that `loses`.
 
     Args:
         own: search of the law itself.
-        fitter, nested: of the law, and of the nested one.
+        fitter, nested: fitters of the law and of the nested law.
         start: parameters of the nested law, and of the plant.
         motions, equation_error: see `horizon_continuation`.
     """
@@ -202,9 +202,9 @@ def best_of_starts(
     nested: HorizonResult,
     equation_error: EquationError,
 ) -> HorizonResult:
-    """A law's own end, or a lower one reached from the end of its nested law.
+    """The end of a law's own search, or a lower one reached from the end of its nested law.
 
-    A nonlinear law has several minima, and the plant determines to which of them the torques lead.
+    A nonlinear law has several minima, and the plant determines which of them the torques lead to.
     So the search is repeated from the coefficients that they imply on the nested law's plant and,
     as long as its residual exceeds the nested law's, from that law itself. Priors guide each
     search; ends are compared only by their residuals. Longer windows win if only the nested law
@@ -214,10 +214,10 @@ def best_of_starts(
         return own.as_stopped()
     windows, options, law = _windows_from(nested), fitter.options, fitter.friction.law
     same = windows.spans == own.problem.windows.spans
-    # If one of the two failed at the longest windows, residuals cannot be compared.
+    # If one of the two failed at the longest windows, their residuals cannot be compared.
     if not same and len(windows) >= len(own.problem.windows):
         return own
-    # With the larger noise of the two, priors would outweigh the data.
+    # With the larger of the two noises, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
     implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
@@ -254,7 +254,7 @@ def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
 
 
 def _windows_from(found: HorizonResult) -> Windows:
-    """The windows of a stage at the states that it found, except for known states."""
+    """The windows of a stage, starting at the states that it found unless these are known."""
     windows = found.problem.windows
     states = found.problem.variables.split(found.result.x).states
     joints = windows.q0.shape[-1]
@@ -267,7 +267,7 @@ def _windows_from(found: HorizonResult) -> Windows:
 def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:
     """Half the sum of squares of residuals, infinite if the motion diverged.
 
-    Stages to be compared have the same loss.
+    Stages that are compared must have the same loss.
     """
     problem, x = replace(found.problem, loss=loss), found.result.x
     misfit = weighted_cost(problem.counted_errors(x), noise)

@@ -1,4 +1,4 @@
-"""Horizon continuation: shooting windows of growing length, each started at the previous end."""
+"""Horizon continuation: shooting windows of growing length, each started from the previous."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -36,7 +36,7 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Coefficients (joint, coefficient) that torques imply on a plant: the best, then the best at each
+# Coefficients (joint, coefficient) that torques imply for a plant: the best, then the best for each
 # of the law's initial values.
 EquationError = Callable[[Plant], Iterable[Tensor]]
 
@@ -50,7 +50,7 @@ class HorizonResult:
 
     @cached_property
     def residuals(self) -> Tensor:
-        """Position errors as weighted by the loss [rad; m], (window, step + 1, joint)."""
+        """Position errors weighted by the loss [rad; m], (window, step + 1, joint)."""
         return self.problem.counted_errors(self.result.x)
 
     @property
@@ -79,7 +79,7 @@ class HorizonResult:
         return explained(self.problem, self.result.x, self.rms)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
-        """True if the longer windows only show that the motion is chaotic within them."""
+        """True if the longer windows show only that the motion is chaotic within them."""
         return not self.rms <= options.max_growth * before.rms and not self.result.converged
 
     def as_stopped(self) -> "HorizonResult":
@@ -92,7 +92,7 @@ class ShootingFitter:
     """Poses and solves shooting problems of one friction model, plant and set of recordings.
 
     The recordings are in joint coordinates; `callback` is called with a stage name after every
-    step, True stops; for the other attributes see `ShootingProblem`.
+    step and stops the search by returning True; for other attributes see `ShootingProblem`.
     """
 
     jacobian: StepJacobian
@@ -107,15 +107,15 @@ class ShootingFitter:
     extrapolation: ExtrapolationPrior | None = None
 
     def cut(self, motions: Sequence[Motion], length: float) -> Windows:
-        """Windows of the recordings, each from the state that a motion has there."""
-        # Encoders zeroed in a pose held by stiction were zeroed at rest.
+        """Windows of the recordings, each starting from the state of its motion."""
+        # Encoders zeroed in a pose that stiction holds were zeroed at rest.
         rest_speed = None if self.offset_sd is None else self.options.rest_speed
         return cut_windows(self.recordings, motions, length, rest_speed=rest_speed)
 
     def problem(
         self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
     ) -> ShootingProblem:
-        """The problem of windows that starts at these friction parameters."""
+        """The shooting problem of windows, started from these friction parameters."""
         model = model_at(self.friction, friction)
         longest_step = max(r.longest_step for r in self.recordings)
         return ShootingProblem(
@@ -133,8 +133,8 @@ class ShootingFitter:
     ) -> HorizonResult:
         """Minimise a problem of this fitter.
 
-        `tolerance` is the relative decrease of the cost that counts as zero, `name` is for the
-        callback. A robust loss without a scale finally gets that of the errors.
+        `tolerance` is the relative decrease of the cost that counts as zero; `name` is passed to
+        the callback. A robust loss without a scale finally gets the scale of the errors.
         """
         options, x = self.options, start
         solver = LevenbergMarquardt(
@@ -191,7 +191,7 @@ class StallMonitor:
         return "creeping" if before - step.cost <= patience * self.tolerance * before else None
 
     def _move(self, x: Tensor, local: Quadratic, step: Step) -> float:
-        """Largest move of a shared variable in a full step, in standard deviations."""
+        """Largest change of a shared variable in a full step, in standard deviations."""
         if self.problem.friction.schedule.follows_motion:
             return torch.inf
         count = self.problem.variables.shared_count
@@ -201,10 +201,10 @@ class StallMonitor:
             return torch.inf
         precision, _ = self.problem.variables.prior()
         sd = standard_deviations(information(local.hessian, precision, count))
-        # The curvature of chaotic windows is round-off, in terms of which nothing would move.
+        # The curvature of chaotic windows is round-off; measured by it, nothing would move.
         if torch.isinf(sd).all():
             return torch.inf
-        # The noise of a first stage is a guess; if it is too large, moves look small.
+        # The noise of a first stage is a guess; if it is too large, changes look small.
         samples = float(self.problem.windows.weight.sum()) * self.problem.windows.q.shape[-1]
         noise = min(1.0, math.sqrt(2.0 * float(local.cost) / samples))
         return float(((x - before)[:count] / sd).abs().max()) / max(noise, 1e-9)
@@ -230,7 +230,7 @@ class Continuation:
         return self.stages[-1]
 
     def ending(self, end: HorizonResult) -> "Continuation":
-        """The continuation with another last stage."""
+        """The continuation with a different last stage."""
         return replace(self, stages=(*self.stages[:-1], end))
 
 
@@ -242,18 +242,18 @@ def horizon_continuation(
     equation_error: EquationError | None = None,
     of: str = "",
 ) -> Continuation:
-    """Search windows of growing length, each with the states and the noise of the previous one.
+    """Search windows of growing length, each from the states and the noise of the previous stage.
 
-    A horizon that fails, or whose parameters are worse on shorter ones (`loses`), is skipped, and
-    so are longer ones.
+    A horizon that fails, or whose parameters are worse on shorter horizons (`loses`), is skipped,
+    and so are all longer ones.
 
     Args:
-        fitter: of the model; `options.windows` are the lengths.
+        fitter: of the model; `options.windows` gives the lengths.
         friction, plant: parameters to start from.
         motions: smoothed, in joint coordinates.
-        equation_error: repeats the first and the last stage from coefficients that torques imply
-            on the fitted plant, because a nonlinear law has several minima, and with a slightly
-            wrong inertia the torques lead to a worse one.
+        equation_error: gives coefficients that torques imply on the fitted plant, from which the
+            first and the last stage are repeated, because a nonlinear law has several minima and
+            the torques lead to a worse one if the inertia is slightly wrong.
         of: suffix of the stages' names.
     """
     options = fitter.options
@@ -266,14 +266,14 @@ def horizon_continuation(
         problem = fitter.problem(fitter.cut(simulated, length), noise, friction)
         start = problem.variables.start(plant, offsets)
         if stages:
-            # States of shorter windows drift apart within longer ones. If they were corrected
-            # together with the parameters, the first step would move these far away.
+            # Simulations from the states of shorter windows diverge over longer ones. Correcting
+            # states and parameters together, the first step would move the parameters far away.
             start, stopped = settle_states(problem, start)
             if stopped:
                 return Continuation((*stages[:-1], stages[-1].as_stopped()), rest)
         tolerance = options.loose_tolerance
         if last:
-            # The cost at the minimum is estimated from the last stage, not from the distant start.
+            # The cost at the minimum is estimated from the last stage, as the start is far from it.
             near = weighted_cost(stages[-1].residuals, noise) if stages else None
             tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
         name = f"{problem.windows.length:g} s windows{of}"
@@ -292,7 +292,7 @@ def horizon_continuation(
             return Continuation(tuple(stages), rest, "noisy" if noisy else "lossy")
         found = kept[0]
         if fitter.friction.law.memory and not (found.stopped or found.result.converged):
-            # Sensitive contacts at the start raise the damping, which keeps steps short.
+            # Sensitive contacts at the start raise the damping, which then keeps steps short.
             found = fitter.search(found.problem, found.result.x, tolerance, name)
         stages.append(found)
         noise = max(found.noise, options.min_noise)
@@ -329,13 +329,13 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     """True if a stage's parameters are significantly worse on the windows of earlier stages.
 
     If the encoder's rounding explains the residuals of shorter windows, law and plant are correct,
-    and the stage loses if the likelihood there falls by more than uncertain parameters explain.
-    Otherwise law or plant are wrong, and short horizons may be traded for long ones: freely on free
-    swings, but errors of a measured torque accumulate over a long window and bias its parameters.
-    Even if law and plant are correct, torque noise accumulates, so that longer windows may
-    determine friction less well (`knows_less`). Since the noise of each horizon is unknown, its log
-    likelihood is that of the root mean square residual; a stage loses if its parameters are worse
-    at a shorter horizon by more than its noise, and gain less at their own.
+    and the stage loses if the likelihood there falls by more than parameter uncertainty explains.
+    Otherwise law or plant is wrong, and accuracy at short horizons may be traded for long ones: on
+    free swings without limit, but errors of a measured torque accumulate over a long window and
+    bias its parameters. Even with a correct law and plant, torque noise accumulates, so longer
+    windows may determine friction less well (`knows_less`). As the noise of each horizon is
+    unknown, its log likelihood uses the RMS residual; a stage loses if its parameters are worse at
+    a shorter horizon by more than its noise, and gain less at their own.
     """
     from scipy.special import chdtri  # slow to import
 
@@ -388,7 +388,7 @@ def _log_volume(of: HorizonResult) -> float:
 
 
 def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:
-    """Squared residuals of each window of a stage with the parameters of another one, (window,)."""
+    """Squared residuals of each window of a stage with another stage's parameters, (window,)."""
     if at is of:
         return of.residuals.square().sum((1, 2))
     count = at.problem.variables.shared_count
@@ -404,11 +404,11 @@ def restart_from_equation_error(
     name: str,
     equation_error: EquationError,
 ) -> HorizonResult:
-    """A stage, or a lower one from coefficients that torques imply on its plant.
+    """A stage, or a better one started from coefficients that torques imply on its plant.
 
     The stage's own start is not tried again. The starts after the first, from the law's grid of
-    initial values, are tried only if the encoder's rounding does not explain the residual, because
-    then there is no lower minimum.
+    initial values, are tried only if the encoder's rounding does not explain the residual; if it
+    does, there is no lower minimum.
     """
     problem, plant = found.problem, found.parts.plant
     best = found
@@ -417,7 +417,7 @@ def restart_from_equation_error(
             break
         begun = replace(problem, friction=model_at(problem.friction, friction.reshape(-1)))
         x = begun.variables.start(plant, found.parts.offsets)
-        # As on the first windows of a plant that is not fitted.
+        # As for the first windows if the plant is not fitted.
         if torch.equal(x, start):
             continue
         count = begun.variables.shared_count

@@ -1,6 +1,6 @@
-"""Extrapolation prior: a network is pulled to its constant law at unvisited motions.
+"""Extrapolation prior: a network is pulled toward its constant law at unvisited motions.
 
-Fuzzy sets reach far: friction learned at the turning points of large swings also affects small
+Fuzzy sets are wide: friction learned at the turning points of large swings also affects small
 swings, slow and weakly accelerated, which the recordings do not contain.
 """
 
@@ -21,10 +21,10 @@ from nfriction.signals import Motion
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ExtrapolationPrior:
-    """Points of the input range at which coefficients are pulled to those of the constant law.
+    """Points of the input range at which coefficients are pulled toward the constant law.
 
-    `qd` and `qdd` are (point, joint), `weight` 1 where no sample came near, else 0, and `sd` the
-    expected deviation in units of the coefficients' scale.
+    `qd` and `qdd` are (point, joint); `weight` is 1 where no sample is near, otherwise 0; `sd` is
+    the expected deviation in units of the coefficients' scale.
     """
 
     qd: Tensor
@@ -34,20 +34,20 @@ class ExtrapolationPrior:
 
     @torch.no_grad()
     def residuals(self, schedule: Schedule) -> Tensor:
-        """Deviation of a neuro-fuzzy schedule's coefficients over `sd`, in one row."""
+        """Deviations of a neuro-fuzzy schedule's coefficients in units of `sd`, flattened."""
         network = cast("NeuroFuzzy", schedule)
         deviation = network(self.qd, self.qdd) - network.reference_coefficients()
         return (deviation * self._factor(network)).flatten()
 
     def normal_equations(self, schedule: Schedule) -> tuple[Tensor, Tensor]:
-        """J^T r and J^T J of the residuals, over the parameter vector."""
+        """J^T r and J^T J of the residuals with respect to the parameter vector."""
         network = cast("NeuroFuzzy", schedule)
         by, factor = network.sensitivities(self.qd, self.qdd), self._factor(network)
         r = self.residuals(network).view_as(factor)
         slopes, count = by.parameters, len(by.joint)
         gradient = torch.zeros(count, dtype=torch.float64)
         hessian = torch.zeros(count, count, dtype=torch.float64)
-        # No parameter acts on two joints.
+        # No parameter affects two joints.
         for j in range(network.joints):
             own = (by.joint == j).nonzero().squeeze(-1)
             active = self.weight[:, j] > 0
@@ -63,7 +63,7 @@ class ExtrapolationPrior:
 def prior_on_unvisited_cells(
     schedule: NeuroFuzzy, motions: Sequence[Motion], options: FitOptions = DEFAULTS
 ) -> ExtrapolationPrior:
-    """Prior at those points of a schedule's trained range that no motion came near."""
+    """Prior at the points of a schedule's trained range that no motion came near."""
     from scipy.ndimage import binary_dilation  # slow to import
 
     visits = visit_histogram(schedule, motions, options.cells)
@@ -84,13 +84,13 @@ def prior_on_unvisited_cells(
 def visit_histogram(
     schedule: NeuroFuzzy, motions: Sequence[Motion], cells: int
 ) -> NDArray[np.float64]:
-    """Samples in each cell of the trained range; those outside count at its edge.
+    """Number of samples in each cell of the trained range; samples outside count at its edge.
 
     Shape (joint, cell of |velocity|, cell of acceleration).
     """
     qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
     if schedule.along_motion:
-        # Not the network's smooth sign, which at a turning point passes through accelerations that
+        # The exact sign: at a turning point the network's smooth one would yield accelerations that
         # the motion never had.
         qdd = np.where(qd < 0, -qdd, qdd)
     lower, upper = (getattr(schedule, f"acceleration_{end}").numpy() for end in ("lower", "upper"))

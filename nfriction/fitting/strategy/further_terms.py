@@ -18,18 +18,18 @@ LATE = "Perhaps {}: with that delay the residual falls by {:.0f} %, and coeffici
 def richer_by_evidence(
     base: HorizonResult, richer: ShootingFitter, name: str
 ) -> HorizonResult | None:
-    """The stage with further terms if the data ask for them, else None.
+    """The stage with further terms if the data support them, otherwise None.
 
     The two plants are compared by their evidence in Laplace's approximation: the decrease of the
-    cost less the Occam factor of the new terms, with residuals inflated for autocorrelation. A
-    first prediction of the decrease from derivatives alone may save the search. The terms of
-    `richer` are those of `base`, then the further ones; `name` is the stage's for the callback.
+    cost minus the Occam factor of the new terms, with residuals inflated for autocorrelation. A
+    prediction of the decrease from derivatives may make the search unnecessary. `richer` has the
+    terms of `base`, followed by the further ones; `name` is the stage's for the callback.
 
     References:
         D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
     """
     further = _FurtherTerms.of(base, richer)
-    # The prediction costs one step, the search it may save costs a whole fit.
+    # The prediction costs one step; the search that it may avoid costs a whole fit.
     if further is None or further.predicted_gain() <= 0:
         return None
     problem, before = further.problem, further.before
@@ -46,14 +46,14 @@ def richer_by_evidence(
 def delay_warning(
     found: HorizonResult, delayed: ShootingFitter, intervals: Sequence[Interval]
 ) -> tuple[list[str], bool]:
-    """A sentence on the delay of the torque that the data ask for, and if friction depends on it.
+    """A sentence on the torque delay that the data indicate, and whether friction depends on it.
 
-    A delay below a sample hardly shows in the balance of torques. A wrong law feigns a delay, too;
-    so friction depends on it only where a coefficient leaves its interval once the delay is fitted.
+    A delay below one sample is hardly visible in the torque balance. A wrong law also looks like a
+    delay; friction depends on it only if fitting it moves a coefficient out of its interval.
     """
     late = richer_by_evidence(found, delayed, "delay of the torque")
     fall = 0 if late is None else round(100 * (1 - late.rms / found.rms))
-    # By no whole percent: in chaotic windows evidence counts what residuals do not show.
+    # Below one percent: in chaotic windows the evidence includes effects not visible in residuals.
     if late is None or fall < 1:
         return [], False
     names = delayed.friction.schedule.parameter_names(delayed.jacobian.plant.joint_names)
@@ -67,7 +67,7 @@ def delay_warning(
 
 @dataclass(frozen=True)
 class _FurtherTerms:
-    """Local model of a stage with further plant terms, which begin at 0 behind its own."""
+    """Local model of a stage with further plant terms, which start at 0 after its own terms."""
 
     problem: ShootingProblem
     before: Quadratic
@@ -84,13 +84,13 @@ class _FurtherTerms:
             return None
         own = base.problem
         problem = richer.problem(own.windows, base.noise, base.parts.friction)
-        # Costs by another integration or loss are not comparable.
+        # Costs with a different integration or loss are not comparable.
         problem = replace(problem, substeps=own.substeps, loss=own.loss)
         first = base.problem.variables.shared_count
         zeros = torch.zeros(count, dtype=torch.float64)
         at_base = torch.cat([base.result.x[:first], zeros, base.result.x[first:]])
         lower, upper = problem.variables.bounds()
-        # Variables at a bound cannot move, so they take no volume of the posterior.
+        # Variables at a bound cannot move, so they do not contribute to the posterior volume.
         known = (at_base > lower) & (at_base < upper)
         known[first : first + count] = False
         both = known.clone()
@@ -104,7 +104,7 @@ class _FurtherTerms:
         return 0.5 * (float(precision.log().sum()) - volume)
 
     def predicted_gain(self) -> float:
-        """Gain of the log evidence that derivatives predict."""
+        """Gain in log evidence predicted from derivatives."""
         decrease = _newton_decrease(self.before, self.both)
         return decrease - _newton_decrease(self.before, self.known) + self.occam(self.before)
 

@@ -1,4 +1,4 @@
-"""Hold-out validation: trained on some windows, judged on the others, each of them in turn."""
+"""Hold-out validation: training on some windows and testing on the others, each in turn."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class StoppedError(Exception):
 def cut_for_folds(
     joint: Sequence[Recording], motions: Sequence[Motion], length: float, folds: int
 ) -> Windows:
-    """At least `folds` windows, so that some can be held out; shorter ones of short recordings.
+    """At least `folds` windows, so that some can be held out; shorter ones for short recordings.
 
     Raises:
         ValueError: if the recordings have too few samples.
@@ -31,7 +31,7 @@ def cut_for_folds(
     cut = cut_windows(joint, motions, length)
     if len(cut) >= folds:
         return cut
-    # No window spans a gap, so the longest stretch between gaps has to give the windows.
+    # No window spans a gap, so the longest segment between gaps has to provide the windows.
     longest = max(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
     return cut_windows(joint, motions, longest / folds)
 
@@ -41,21 +41,21 @@ def holdout_windows(
 ) -> Windows:
     """Windows of a length [s] for `holdout_splits`, or so short that each split holds out several.
 
-    Those held out then lie between others of a similar motion: of a swing that decays, the largest
-    third would be judged by what the smaller ones taught.
+    Each then lies between training windows of similar motion; otherwise the largest third of a
+    decaying swing, for example, would be tested with what was learned from the smaller swings.
     """
     total = sum(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
     return cut_for_folds(joint, motions, min(length, total / folds**2), folds)
 
 
 def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]]:
-    """Windows to train on and those to test on: every `folds`-th, each of them in one split."""
+    """Training and test windows: every `folds`-th is for testing, each in exactly one split."""
     fold = torch.arange(len(windows)) % folds
     return [(windows.subset(fold != k), windows.subset(fold == k)) for k in reversed(range(folds))]
 
 
 def verdict(network: Tensor, law: Tensor) -> str:
-    """Sentence that rejects a network by squared errors on windows, (window,)."""
+    """Sentence that rejects a network, from squared errors on each window, (window,)."""
     ratio, spread = log_ratio(network, law)
     if math.isinf(ratio):
         return "Network rejected: it diverges on hold-out windows; its constant law is kept."
@@ -72,12 +72,12 @@ def holdout_squares(
 ) -> Tensor:
     """Mean squared error on each window [rad^2; m^2], (window,), from its best initial state.
 
-    Smoothed states err by more than the difference between two laws. Infinite where the motion
-    diverges. The problem is of other windows with the same friction model and plant, whose
+    The errors of smoothed states exceed the difference between two laws. Infinite where the motion
+    diverges. The problem is that of other windows with the same friction model and plant, whose
     parameters are given.
 
     Raises:
-        StoppedError: if the search of the initial states was interrupted.
+        StoppedError: if the search for the initial states was interrupted.
     """
     model = model_at(problem.friction, friction)
     judged = replace(problem, windows=test.with_states(problem.jacobian.plant, model))

@@ -1,8 +1,8 @@
-"""Inputs of friction besides the speed, chosen by what a law leaves unexplained.
+"""Inputs of friction other than speed, selected by the residuals of a law.
 
-A candidate is a term of the law with a coefficient of its own (`friction.inputs`). Its evidence is
-that of the Gauss-Newton model at the fitted law, in which one linearisation has every candidate.
-Which candidates a fit takes is then decided on windows held out.
+A candidate is a term of the law with its own coefficient (`friction.inputs`). Its evidence is
+that of the Gauss-Newton model at the fitted law; one linearisation includes every candidate.
+The choice among the candidates is then made on hold-out windows.
 """
 
 import copy
@@ -47,19 +47,19 @@ from nfriction.signals import Motion
 
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
-    """The plant with the loads of its bearings where the load is an input."""
+    """The plant, with its bearing loads if the load is an input."""
     if "load" not in inputs or not plant.has_link_load:
         return plant
     return from_dict({**plant.to_dict(), "normal_load": "bearing"})
 
 
 def candidates(task: FitTask) -> tuple[str, ...]:
-    """Inputs that a law and a plant can take."""
+    """Inputs that are possible with a law and a plant."""
     plant, law = task.plant, task.model.law
     one = torch.ones(1, 1, dtype=torch.float64)
     coefficients = one.expand(1, 1, len(law.names))
     torques = [law.torque(one, load * one, coefficients, 1.0) for load in (1.0, 2.0)]
-    # A bearing's load is known of chains on a fixed pivot; a law of the load has seen one.
+    # Bearing loads are known for chains on a fixed pivot; a load-dependent law uses one already.
     known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
     loaded = known and torch.equal(*torques)
     # The papers' network may have a hidden state of its own.
@@ -76,10 +76,10 @@ def longest_duration(motions: Sequence[Motion]) -> float:
 def heated_schedule(
     law: Law, initial: Tensor, motions: Sequence[Motion], cooling_time: float
 ) -> HeatedConstant:
-    """Constant coefficients of a law with heat, which is 1 where motions heat cold friction most.
+    """Constant coefficients of a law with heat, scaled to peak at 1 if friction stays cold.
 
     Args:
-        law, initial: see `Constant`; `initial` is without any fall by heat.
+        law, initial: see `Constant`; `initial` has no decrease with heat.
         motions: in joint coordinates.
         cooling_time: [s].
     """
@@ -96,9 +96,9 @@ def heated_schedule(
 def widened_fitter(
     task: FitTask, start: FitResult, inputs: Sequence[str], cooling_time: float = math.nan
 ) -> ShootingFitter:
-    """Fitter of a law's constant coefficients and those of inputs, from a fit of the law.
+    """Fitter of constant coefficients of a law and of inputs, started from a fit of the law.
 
-    With the input heat, which cools within `cooling_time` [s].
+    `cooling_time` [s] is the time constant of the input heat.
     """
     law, plant = with_inputs(start.model.law, inputs), seeing_plant(task.plant, inputs)
     known = start.model.schedule.coefficient_sets()["always"]
@@ -119,10 +119,10 @@ def widened_fitter(
 
 
 def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
-    """Constant fit of a law with inputs, from that without; None if stopped.
+    """Constant fit of a law with inputs, started from that without; None if stopped.
 
-    The time in which heat cools is that of the lowest residual, between a window, within which a
-    network sees the motion itself, and the longest recording.
+    The cooling time of heat minimises the residual, between the length of a window (within which
+    a network responds to the motion itself) and that of the longest recording.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
@@ -131,12 +131,12 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     ends: list[HorizonResult] = []
 
     def residual(log_time: float) -> float:
-        """Residual of a search with this cooling time, from the end of the one before."""
+        """Residual of a search with this cooling time, started from the end of the previous one."""
         fitter = widened_fitter(task, start, inputs, math.exp(log_time))
         friction = fitter.friction.schedule.parameter_vector()
         plant, residuals = known_terms(start, fitter.jacobian.terms), start.residuals
-        # With the noise of the law without inputs, a first search is drawn to the prior, and its
-        # windows start with the heat of the previous friction.
+        # With the noise of the law without inputs, a first search is pulled toward the prior, and
+        # its windows start with the heat of the previous friction.
         for _ in range(1 if ends else 2):
             if ends:
                 (friction, plant, *_), residuals = ends[-1].parts, ends[-1].residuals
@@ -167,9 +167,9 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
 
 @torch.no_grad()
 def drives(found: FitResult, own: int) -> bool:
-    """True if coefficients beyond a law's own let friction drive a joint in one direction.
+    """True if coefficients beyond a law's own make friction drive a joint in one direction.
 
-    A constant torque that the plant lacks looks like friction larger in one direction.
+    A constant torque missing from the plant looks like friction that is larger in one direction.
     """
     law, v_smooth = found.model.law, found.model.v_smooth
     for motion in found.motions:
@@ -178,7 +178,7 @@ def drives(found: FitResult, own: int) -> bool:
         without = fitted.clone()
         without[..., own:] = 0.0
         power, least = (qd * law.torque(qd, load, c, v_smooth) for c in (fitted, without))
-        # A law may be wrong at some speeds; a constant torque does work in one direction only.
+        # A law may be wrong at some speeds; a constant torque does work only in one direction.
         for turning in (qd > 0, qd < 0):
             work, own_work = ((p * turning).sum(0) for p in (power, least))
             if (work < own_work.clamp(max=0.0)).any():
@@ -187,10 +187,10 @@ def drives(found: FitResult, own: int) -> bool:
 
 
 def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
-    """Inputs that the evidence favours, the best first, each given the previous ones.
+    """Inputs favoured by the evidence, the best first, each given the previous ones.
 
     Args:
-        task: with recordings and motions free of encoder offsets.
+        task: with encoder offsets removed from recordings and motions.
         start: constant fit of the law.
     """
     names = candidates(task)
@@ -201,12 +201,12 @@ def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
 
 @dataclass(frozen=True)
 class _Choice:
-    """Local models of errors and priors over the shared variables, window states at their best."""
+    """Local models of errors and priors in the shared variables, with optimal window states."""
 
     errors: Quadratic
     prior: Quadratic
     bounds: tuple[Tensor, Tensor]  # of a step
-    columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
+    columns: dict[str, list[int]]  # of each candidate, one coefficient per joint
 
     @classmethod
     def of(
@@ -243,7 +243,7 @@ class _Choice:
     def forward(self, least: float) -> list[InputGain]:
         """Forward selection of inputs, as long as one raises the log evidence by more than `least`.
 
-        Each is judged relative to the residual noise given the inputs selected before.
+        Each is judged relative to the residual noise with the inputs selected so far.
         """
         chosen: list[InputGain] = []
         held: list[int] = []
@@ -267,10 +267,10 @@ class _Choice:
         return chosen
 
     def evidence(self, held: Sequence[int], scale: float) -> tuple[float, float]:
-        """Log evidence with the columns `held`, up to a constant, and the errors' cost.
+        """Log evidence with the columns `held`, up to a constant, and the cost of the errors.
 
         Laplace's approximation at the minimum within the bounds. The squared errors are multiplied
-        by `scale`, to account for a smaller noise than that of the law.
+        by `scale`, to account for a noise smaller than that of the law.
         """
         others = {c for columns in self.columns.values() for c in columns}.difference(held)
         free = [k for k in range(len(self.prior.gradient)) if k not in others]
@@ -298,7 +298,7 @@ class _Choice:
 
 
 def _of_shared(local: Quadratic, shared: int) -> Quadratic:
-    """Local model of the first variables, with the others at their best."""
+    """Local model of the first variables, with the others at their optimum."""
     H, g = local.hessian, local.gradient
     solved = torch.linalg.solve(
         H[shared:, shared:], torch.cat([H[shared:, :shared], g[shared:, None]], 1)

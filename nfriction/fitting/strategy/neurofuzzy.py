@@ -1,10 +1,10 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First the law takes further inputs (`inputs`) with which it wins on hold-out windows. Then the
-network trains with fixed sets, and hold-out windows choose the priors. Training continues with the
-residual noise, with the prior of each group of parameters set by evidence, and moves the sets if
-the evidence favours that; this is repeated with ever smaller noise as long as the hold-out windows
-improve. Every window is held out in turn, and a gain has to exceed its scatter over the windows.
+First, further inputs (`inputs`) are added to the law if they improve it on hold-out windows. Then
+the network is trained with fixed sets, and hold-out windows select the priors. Training continues
+with the residual noise, with the prior of each group of parameters set by evidence, and moves the
+sets if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
+windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
 """
 
 import copy
@@ -119,7 +119,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
-    """Inputs with which the law wins on hold-out windows, and the contest with them; or none."""
+    """Inputs that improve the law on hold-out windows (or none), and the contest with them."""
     task = plain.task
     chosen = chosen_inputs(task, plain.start)
     names = [gain.name for gain in chosen]
@@ -135,14 +135,14 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     if not gains(rival.validation.of_law, plain.validation.of_law, task.options.input_chance):
         return (), plain
     rival.train()
-    # Friction of the law alone may drive a joint even if that of its network does not.
+    # Friction of the constant law may drive a joint even if that of its network does not.
     return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
 
 class _Contest:
     """A network and the constant law that it has to beat.
 
-    Recordings and motions of the task are free of encoder offsets.
+    Encoder offsets are removed from the recordings and motions of the task.
     """
 
     def __init__(self, task: FitTask, start: FitResult) -> None:
@@ -169,7 +169,7 @@ class _Contest:
         self.best: Trial | None = None
 
     def accepts(self, trial: "Trial") -> bool:
-        """True for a network that beats the law on hold-out windows."""
+        """True if the network beats the law on hold-out windows."""
         return gains(trial.squares, self.validation.of_law)
 
     @property
@@ -183,7 +183,7 @@ class _Contest:
         return replace(self.start, model=model, plant=plant)
 
     def train(self) -> None:
-        """Find the best network, once; raises `StoppedError`."""
+        """Find the best network, unless already done; raises `StoppedError`."""
         if self.best is None:
             self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
@@ -229,7 +229,7 @@ class _Contest:
 def input_range(
     motions: Sequence[Motion], along_motion: bool, options: FitOptions = DEFAULTS
 ) -> tuple[Tensor, Tensor]:
-    """Largest |velocity| of motions, (joint,), and limits of their acceleration, (joint, 2)."""
+    """Largest |velocity| of motions, (joint,), and range of their acceleration, (joint, 2)."""
     qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
     along = qdd * np.sign(qd) if along_motion else qdd
     limits = np.quantile(along, options.acceleration_quantiles, axis=0)
@@ -243,7 +243,7 @@ def initialise_from_constant(
     motions: Sequence[Motion],
     options: FitOptions = DEFAULTS,
 ) -> FrictionModel:
-    """A copy of a neuro-fuzzy model at a constant fit of its law, over the range of the motion.
+    """A copy of a neuro-fuzzy model set to a constant fit of its law, for the range of the motion.
 
     Its network is zero; recordings and motions are in joint coordinates.
     """
@@ -263,7 +263,7 @@ def initialise_from_constant(
 def revert_to_constant(
     model: FrictionModel, constant: FitResult, options: FitOptions = DEFAULTS
 ) -> None:
-    """Set a neuro-fuzzy model to a constant fit of its law; coefficients of zero stay so."""
+    """Set a neuro-fuzzy model to a constant fit of its law; zero coefficients stay zero."""
     schedule = cast("NeuroFuzzy", model.schedule)
     values = constant.model.schedule.coefficient_sets()["always"]
     schedule.set_reference(values, schedule.scale, options.zero_reference)
@@ -271,10 +271,10 @@ def revert_to_constant(
 
 
 def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[ShootingFitter, ...]:
-    """Fitters with ever wider priors of the plant: the posterior sd of the constant fit first.
+    """Fitters with ever wider plant priors, starting with the posterior sd of the constant fit.
 
-    Within the recorded motion plant and network can compensate each other; outside, where the
-    network fades, such a plant is wrong.
+    Within the recorded motion, errors of plant and network can compensate each other; outside it,
+    where the network tapers off, that plant would be wrong.
     """
     assert free.plant_prior is not None
     mean, sd = free.plant_prior
@@ -288,9 +288,9 @@ def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[Shoot
 def local_model(end: HorizonResult) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Curvature of errors and of known priors, offsets and groups, for `group_evidence`.
 
-    From the Gauss-Newton model at a search's end with window states marginalised, in units of the
-    network's prior, so that each group has precision 1. The plant's prior and that on unvisited
-    motion are known.
+    From the Gauss-Newton model at the end of a search, with window states marginalised, in units of
+    the network's prior, so that each group has precision 1. The priors of the plant and on
+    unvisited motions are known.
     """
     problem, variables = end.problem, end.problem.variables
     schedule = cast("NeuroFuzzy", model_at(problem.friction, end.parts.friction).schedule)
@@ -309,27 +309,27 @@ def local_model(end: HorizonResult) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     lower, upper = (bound[:shared] for bound in variables.bounds())
     fitted = (lower < upper).nonzero().flatten()
     values, vectors = torch.linalg.eigh(data[fitted][:, fitted])
-    # Negative eigenvalues are round-off of states that grow by orders of magnitude.
+    # Negative eigenvalues are round-off from states that grow by orders of magnitude.
     data = (vectors * values.clamp_min(0.0)) @ vectors.T
     offset = (end.result.x - mean)[:shared] / unit
     return data, known[fitted][:, fitted], offset[fitted], groups[fitted]
 
 
 def network_evidence(end: HorizonResult) -> GroupEvidence:
-    """Evidence for the prior of each group of a network, relative to the present prior."""
+    """Evidence for the prior of each group of a network, relative to the current prior."""
     groups = len(cast("NeuroFuzzy", end.problem.friction.schedule).group_names())
     return group_evidence(*local_model(end), torch.ones(groups, dtype=torch.float64))
 
 
 def log_evidence(end: HorizonResult) -> float:
-    """Log evidence up to a constant, comparable at equal noise; -inf if it is not finite."""
+    """Log evidence up to a constant, comparable only at equal noise; -inf if not finite."""
     if not end.result.hessian.isfinite().all():
         return -math.inf
     return network_evidence(end).occam - float(end.result.cost)
 
 
 def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ...]:
-    """Name of each group of a network, how many parameters the data determine, and its size."""
+    """Per group of a network: name, number of parameters that the data determine, and size."""
     if not torch.isfinite(end.result.hessian).all():
         return ()
     schedule = cast("NeuroFuzzy", end.problem.friction.schedule)
@@ -341,7 +341,7 @@ def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ..
 class Trial:
     """A model trained on the windows of the first split, and its priors.
 
-    Its squared errors are those on hold-out windows: of the first split, or of all once judged.
+    Its squared errors are those on hold-out windows: of the first split, or of all when judged.
     """
 
     squares: Tensor
@@ -352,12 +352,12 @@ class Trial:
 
     @property
     def finite(self) -> bool:
-        """False where the motion diverges."""
+        """False if the motion diverges."""
         return bool(self.squares.isfinite().all() and self.end.result.hessian.isfinite().all())
 
 
 class Validation:
-    """Networks judged against a constant law on hold-out windows of one length [s]."""
+    """Comparison of networks with a constant law on hold-out windows of one length [s]."""
 
     def __init__(
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
@@ -367,11 +367,11 @@ class Validation:
         self.plant = law.plant_prior[0]
         self.windows = holdout_windows(law.recordings, motions, length, self.options.folds)
         self.splits = holdout_splits(self.windows, self.options.folds)
-        # The noise against which the priors weigh is the residual of the constant law at the same
-        # horizon; its cost scales the tolerance.
+        # The noise that sets the weight of the priors is the residual of the constant law at the
+        # same horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
         self.stride = decimation(start.residuals, self.options)
-        # Below it a network would learn the noise, and rounding that a periodic motion repeats.
+        # Below this a network would learn noise, and rounding that a periodic motion repeats.
         self.explained = self.options.explained_ratio * (start.noise or 0.0)
         cost = weighted_cost(start.residuals, self.noise)
         self.tolerance = loglik_tolerance(cost, self.options)
@@ -383,12 +383,12 @@ class Validation:
         return self.judged(self.trial(self.law, values, "constant law, hold-out")).squares
 
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
-        """The best of all priors; wider plant priors must earn their place."""
-        assert len(self.of_law)  # the law first: a network cannot be judged without it
+        """The trial with the best prior; a wider plant prior is used only if clearly better."""
+        assert len(self.of_law)  # the law first: a network is judged relative to it
         best: Trial | None = None
         for fitter in fitters:
             schedule = cast("NeuroFuzzy", fitter.friction.schedule)
-            # From zero, because a network would stay at another prior's end.
+            # From zero, because a network would stay where another prior left it.
             zeros = torch.zeros_like(schedule.parameter_vector())
             trials = []
             for share in self.options.prior_shares:
@@ -403,18 +403,18 @@ class Validation:
         return best
 
     def trained_on(self, trial: Trial) -> Trial:
-        """A trial trained further at its residual noise, or itself if that gains too little.
+        """A trial trained further at its residual noise, or unchanged if that gains too little.
 
         With the law's error as noise, sets could hardly move. They move if the evidence favours it.
-        Windows that the measurement noise explains cannot judge; in that case training continues as
-        long as its noise falls, since with too large a noise the priors outweigh the data.
+        Windows explained by measurement noise cannot discriminate; then training continues as long
+        as its noise falls, since with too large a noise the priors outweigh the data.
         """
         residuals, used = trial.end.residuals, trial.end.problem.noise_sd
         noise = max(min(effective_noise(residuals), self.noise), self.options.min_noise)
         explained = trial.squares.median() <= self.explained**2
         if explained and self.options.explained_ratio * noise >= used:
             return trial
-        # Shorter correlations than the law's let more samples count.
+        # If correlations are shorter than the law's, more samples are used.
         stride = min(decimation(residuals, self.options), trial.end.problem.stride)
         held = self._adapted(trial, noise, stride, learn_sets=False)
         moved = self._adapted(held, noise, stride, learn_sets=True)
@@ -426,9 +426,9 @@ class Validation:
         return judged if explained and not gains(trial.squares, judged.squares) else trial
 
     def _adapted(self, trial: Trial, noise: float, stride: int, *, learn_sets: bool) -> Trial:
-        """A trial trained further, the prior of each group tightened as far as evidence favours it.
+        """A trial trained further, with the prior of each group tightened if evidence favours that.
 
-        It is never widened, because beyond it the errors are not quadratic in the sets.
+        Priors are never widened, because beyond them the errors are not quadratic in the sets.
         """
         model = model_at(trial.fitter.friction, trial.end.parts.friction)
         schedule = cast("NeuroFuzzy", model.schedule)
@@ -462,7 +462,7 @@ class Validation:
     def lost_by(self, end: HorizonResult) -> str:
         """Reason to reject a network that is worse than its law over the law's windows, or "".
 
-        Hold-out windows are shorter, and hardly show a small error of the torque.
+        Hold-out windows are shorter, and insensitive to small torque errors.
         """
         windows = self.law.cut(self.motions, self.length)
         if end.stopped or windows.spans == self.windows.spans:
@@ -481,13 +481,13 @@ class Validation:
         return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
 
     def trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> Trial:
-        """A search of the first split."""
+        """A search on the first split."""
         problem = fitter.problem(self.splits[0][0], self.noise, friction, stride=self.stride)
         end = fitter.search(problem, problem.variables.start(self.plant), self.tolerance, name)
         return Trial(self._errors(end), fitter, end, self.tolerance)
 
     def judged(self, trial: Trial) -> Trial:
-        """A trial with its errors on each window, by searches of the others."""
+        """A trial with its error on every window, from searches on the other windows."""
         found = [trial.squares]
         for place, (train, _) in enumerate(self.splits[1:], 1):
             end = self._further(trial, train, "other windows, hold-out")
@@ -506,7 +506,7 @@ class Validation:
 def constant_kept(
     start: FitResult, model: FrictionModel, note: str, *, converged: bool = True
 ) -> FitResult:
-    """The constant fit as the fit of a model that equals its law; a note gives the reason."""
+    """The constant fit, as the fit of a model set to its law; a note gives the reason."""
     return replace(
         start,
         model=model.requires_grad_(False),

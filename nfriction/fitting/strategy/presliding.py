@@ -1,7 +1,7 @@
-"""Starts of laws with memory, and stiffness that data do not determine.
+"""Starts for laws with memory, and stiffness that the data do not determine.
 
-Presliding may extend over a thousandth of an encoder count or over thousands, so displacements are
-tried one by one on short windows.
+Presliding may extend over a thousandth of an encoder count or over thousands of counts, so
+displacements are tried one by one on short windows.
 """
 
 import itertools
@@ -23,14 +23,14 @@ from nfriction.signals import Motion
 # [s]: from hardly visible to values that mean no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
-# Distance from a reversal, relative to that range, beyond which a contact surely slides.
+# Distance from a reversal, relative to that range, beyond which a contact certainly slides.
 TRAVELLED = 0.1
 # Relative excess of static friction, which torques of sticking joints do not show.
 PEAKS = (0.1, 0.3, 1.0)
-# Displacements searched if the first leaves more than the encoder's rounding.
+# Number of displacements searched if the residual of the first exceeds the encoder's rounding.
 MOST_STARTS = 4
 
-# Stiffness and damping of a rival relative to those found: its contacts relax at once.
+# Stiffness and damping of an alternative relative to those found: its contacts relax at once.
 STIFFER = (10.0, 0.01)
 
 
@@ -40,11 +40,11 @@ def presliding_starts(
 ) -> Iterator[Tensor]:  # fmt: skip
     """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
 
-    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which describe
-    only sliding; `apart`, (joint, coefficient), is the first set from the torques far from
-    reversals, and replaces it if short windows agree better with it. Presliding displacement (a
-    share of the joint's range) and damping (a time) are chosen by the cost of short windows; the
-    excess of static friction and its velocity likewise, in turn. Several displacements of the first
+    `sliding` contains sets of coefficients implied by torques, (set, joint, coefficient), which
+    describe only sliding; `apart`, (joint, coefficient), is the first set computed from torques far
+    from reversals, and replaces that set if it fits short windows better. Presliding displacement
+    (relative to the joint's range) and damping (a time) are chosen by the cost of short windows;
+    then likewise the excess of static friction and its velocity. Several displacements of the first
     set follow, and the best of every other set if the law has no such excess.
     """
     for place, coefficients in enumerate(sliding):
@@ -60,7 +60,7 @@ def presliding_starts(
 def _yielding_alike(
     fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
 ) -> "list[_Start]":
-    """The best coefficients for every share of the range, smallest cost of short windows first."""
+    """Best coefficients for each displacement, in ascending order of the cost of short windows."""
     law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
     ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
 
@@ -106,19 +106,19 @@ def ambiguous_stiffness(
 
     Presliding that the encoder does not resolve has minima of about equal cost at very different
     stiffness. A search from much stiffer bristles finds another one; if it differs by more than a
-    factor of two and the likelihood does not prefer the first, neither is known. The same holds if
-    a search ended early, and the other one explains the motion to the encoder's rounding.
+    factor of two and the likelihood does not favour the first, the value is not identifiable. The
+    same holds if a search ended early and the other explains the motion to encoder resolution.
 
     Args:
         fitter: of the law.
-        found: its end.
-        stage: of short windows, whose states hardly trap a search.
+        found: end of its search.
+        stage: a stage with short windows, whose states hardly trap a search.
     """
     from scipy.special import chdtri  # slow to import
 
     problem, law = stage.problem, stage.problem.friction.law
     count, tolerance = problem.variables.shared_count, fitter.options.loose_tolerance
-    # Terms that only the end may have are last.
+    # Terms that only the final stage may have are last.
     start = torch.cat([found.result.x[:count], stage.result.x[count:]])
     found = fitter.search(problem, start, tolerance, "stiffness")
     places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
@@ -129,7 +129,7 @@ def ambiguous_stiffness(
     rival = fitter.search(problem, start, tolerance, "stiffer bristles")
     # The noise of a first stage is a guess.
     lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
-    # The costs of searches that ended before a minimum are not likelihoods.
+    # If a search ended before its minimum, its cost cannot be compared as a likelihood.
     early = not (found.result.converged and rival.result.converged)
     explained = early and rival.rms <= rounding(problem)
     if not (explained or lost < 0.5 * float(chdtri(len(table) * len(places), 0.05))):
@@ -159,7 +159,7 @@ def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -
     """Coefficients of one joint with the same sliding friction and a presliding displacement.
 
     `time` is the ratio of the damping of a bristle to its stiffness [s]. Laws with other names for
-    these coefficients are unchanged.
+    these coefficients are left unchanged.
     """
     values = dict(zip(law.names, coefficients.tolist(), strict=True))
     widths = [name for name in values if name.startswith("d_") and f"k{name[1:]}" in values]

@@ -21,7 +21,7 @@ def peak_envelope(size: Tensor, fading: Tensor | float) -> Tensor:
 
     Args:
         size: not negative, (sample, ...).
-        fading: what is left of a peak after one sample, between 0 and 1.
+        fading: fraction of a peak that remains after one sample, between 0 and 1.
     """
     # max of size_i f^(k-i) over i <= k, as a running maximum of logarithms.
     steps = torch.arange(len(size), dtype=size.dtype, device=size.device)
@@ -33,10 +33,10 @@ def peak_envelope(size: Tensor, fading: Tensor | float) -> Tensor:
 class Adaptive(Tabulated):
     """Constant coefficients for each class of acceleration and joint.
 
-    The class follows the recent size of the acceleration: the causal envelope of |qdd|, which
-    jumps to a peak at once and fades with a time constant. It changes when the envelope leaves a
-    band around a threshold, so that it cannot chatter there. What is remembered of a joint from
-    sample to sample is the envelope and the class.
+    The class follows the recent magnitude of the acceleration: the causal envelope of |qdd|, which
+    rises to a peak at once and decays with a time constant. It changes when the envelope leaves a
+    band around a threshold, so it cannot chatter there. The hidden state of a joint consists of
+    the envelope and the class.
 
     Args:
         law: the law whose coefficients these are.
@@ -45,9 +45,9 @@ class Adaptive(Tabulated):
             (joint, coefficient) or (coefficient,).
         hysteresis: a class is entered at `threshold * (1 + hysteresis)` on the way up and left at
             `threshold / (1 + hysteresis)` on the way down.
-        time_constant: in which the envelope fades to 1/e [s]. Shorter than half a swing it would
+        time_constant: of the envelope's decay [s]. If shorter than half a swing, the envelope would
             fall between two peaks.
-        sample_time: at which the memory is advanced [s]; a fit sets it to the recording's.
+        sample_time: at which the hidden state advances [s]; a fit sets it to the recording's.
 
     Raises:
         ValueError: if an option is not positive and finite (the hysteresis may be zero).
@@ -61,8 +61,8 @@ class Adaptive(Tabulated):
     handles_range = True
     form = "adaptive"
 
-    # An acceleration beyond this many upper thresholds is no more than high: one wild value must
-    # not keep the class for long. Final, so that TorchScript takes it for a constant.
+    # The envelope is limited to this multiple of the upper threshold, so that one outlier does not
+    # hold the class for long. `Final`, so that it is a constant for TorchScript.
     ceiling: Final[float] = 4.0
 
     thresholds: Tensor
@@ -88,7 +88,7 @@ class Adaptive(Tabulated):
         borders = self.raw.detach().new_tensor([20.0, 100.0])
         self.register_buffer("thresholds", borders.repeat(joints, 1))
         self.register_buffer("swing_rate", torch.zeros_like(self.thresholds[:, 0]))
-        # What follows from the options is no state of its own.
+        # Values that follow from the options are not stored.
         self.register_buffer("fading", borders.new_zeros(()), persistent=False)
         band = borders.new_tensor(1.0 + self.hysteresis)
         self.register_buffer("band", band, persistent=False)
@@ -96,7 +96,7 @@ class Adaptive(Tabulated):
 
     @torch.no_grad()
     def set_sample_time(self, sample_time: float) -> None:
-        """Set the time between samples [s], from which the envelope's fading follows.
+        """Set the sample time [s], on which the decay of the envelope depends.
 
         Raises:
             ValueError: if it is not positive and finite.
@@ -108,13 +108,13 @@ class Adaptive(Tabulated):
     def set_classes(
         self, thresholds: Tensor | Sequence, swing_rate: Tensor | Sequence | None = None
     ) -> None:
-        """Set where the classes of acceleration meet.
+        """Set the boundaries between the classes of acceleration.
 
         Args:
             thresholds: between low and medium, medium and high [rad/s^2], (joint, 2) or (2,).
-            swing_rate: size of acceleration over velocity of each joint [rad/s], (joint,). It
-                estimates the envelope of a motion that starts at full speed, where the
-                acceleration is small. Unchanged where not given (initially zero: not used).
+            swing_rate: ratio of acceleration to velocity amplitude of each joint [rad/s], (joint,).
+                It gives the envelope of a motion that starts at full speed, where the
+                acceleration is small. Unchanged if omitted (initially zero: not used).
 
         Raises:
             ValueError: if thresholds are not positive, finite and ascending, or rates negative.
@@ -147,19 +147,19 @@ class Adaptive(Tabulated):
 
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         envelope = self._envelope(qdd.abs(), self.fading * state.select(-1, 0))
-        # Going up at the band's upper edge, down at its lower one, else staying.
+        # Up at the upper edge of the band, down at its lower edge, otherwise unchanged.
         at_least = self._count(envelope, self.thresholds * self.band)
         at_most = self._count(envelope, self.thresholds / self.band)
         known = torch.minimum(torch.maximum(state.select(-1, 1), at_least), at_most)
         return torch.stack([envelope, known], -1)
 
     def _envelope(self, size: Tensor, faded: Tensor) -> Tensor:
-        # A comparison with NaN is false: one lost sample leaves the memory whole.
+        # A comparison with NaN is false, so one lost sample does not corrupt the hidden state.
         risen = torch.where(size > faded, size, faded)
         return torch.minimum(risen, self.ceiling * self.thresholds.select(-1, 1))
 
     def _count(self, envelope: Tensor, borders: Tensor) -> Tensor:
-        """Number of borders that the envelope exceeds: the class."""
+        """Number of borders that the envelope exceeds, which is the class."""
         first = (envelope > borders.select(-1, 0)).to(envelope.dtype)
         return first + (envelope > borders.select(-1, 1)).to(envelope.dtype)
 
@@ -192,10 +192,10 @@ class Adaptive(Tabulated):
     def states(self, qd: Tensor, qdd: Tensor, time: Tensor | None = None) -> Tensor:
         if time is not None and len(time) > 1:
             return at_sample_time(self, float(time.diff().median())).states(qd, qdd)
-        # As in the base class, but without a step of torch to every sample.
+        # As in the base class, but without torch operations for every sample.
         first = torch.sqrt(qdd[:1] ** 2 + (self.swing_rate * qd[:1]) ** 2)
         size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)
-        # As the envelope never exceeds its ceiling, neither need what goes into it.
+        # As the envelope never exceeds its ceiling, its input need not either.
         size = torch.minimum(size, self.ceiling * self.thresholds[:, 1])
         envelope = peak_envelope(size, self.fading)
         at_least = self._count(envelope, self.thresholds * self.band).T.tolist()
@@ -222,7 +222,7 @@ class Adaptive(Tabulated):
         return self.states(qd, qdd)[..., 1].to(torch.int64)
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        """Derivatives at motions (sample, joint), each sample taken for a first one."""
+        """Derivatives at motions (sample, joint), each sample treated as a first one."""
         _, cells, k = self.raw.shape
         known = self.initial_state(qd, qdd).select(-1, 1)
         options = torch.arange(cells, dtype=known.dtype, device=known.device)

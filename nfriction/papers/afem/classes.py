@@ -17,15 +17,15 @@ from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
-# By recording, by joint: (class, start [s], end [s]).
+# By recording and joint: (class, start [s], end [s]).
 Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
 
-# With less variation than this ratio the windowed peak has no classes.
+# If the windowed peak varies by less than this ratio, there are no classes.
 LEAST_VARIATION = 1.5
-# Below this [rad/s^2] a joint does not accelerate; keeps logarithms finite.
+# Smaller accelerations [rad/s^2] count as zero; this keeps logarithms finite.
 STILL = 1e-6
-# Smaller accelerations, relative to a joint's largest, count as this: otherwise creeping to rest
-# would be a class of its own, and only two would be left for all swings.
+# Lower limit relative to a joint's largest acceleration: otherwise creeping to rest would be a
+# separate class, and only two would remain for all swings.
 DYNAMIC_RANGE = 1e-2
 
 
@@ -34,10 +34,10 @@ class ClassOptions:
     """Classes, found or given, and the prior of their coefficients.
 
     Attributes:
-        thresholds: given ones [rad/s^2], (joint, 2) or (2,).
-        intervals: given ones, by recording and joint; samples outside belong to the nearest.
+        thresholds: given thresholds [rad/s^2], (joint, 2) or (2,).
+        intervals: given intervals by recording and joint; other samples belong to the nearest.
         window: length of the moving window [s], longer than half a swing.
-        least: a class with less data than this takes its neighbour's coefficients [s].
+        least: a class with less data than this [s] uses its neighbour's coefficients.
         prior_sd: standard deviation of a class around the constant law, in units of a coefficient
             that explains a third of the friction (or of the coefficient itself, if larger).
 
@@ -65,8 +65,8 @@ class AccelerationClasses:
 
     Attributes:
         labels: class of every sample, 0 to 2, (sample, joint) of each recording.
-        stands_for: class whose coefficients each class takes: itself, or a neighbour where there
-            are too few data of it, (joint, class).
+        stands_for: class whose coefficients each class uses: itself, or a neighbour if it has too
+            few data, (joint, class).
         notes: joints and classes with too few data, in words.
     """
 
@@ -78,7 +78,7 @@ class AccelerationClasses:
 def class_intervals(
     time: Array, labels: NDArray[np.integer[Any]]
 ) -> list[tuple[str, float, float]]:
-    """Class, start and end [s] of every run of equal labels (sample,): a joint in Table 6."""
+    """Class, start and end [s] of every run of equal labels (sample,), as in Table 6."""
     edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), len(labels) - 1]
     return [
         (CLASSES[labels[a]], float(time[a]), float(time[b])) for a, b in pairwise(edges) if b > a
@@ -95,12 +95,12 @@ def find_classes(
     """Find classes of acceleration and set the schedule to them.
 
     Two thresholds divide the logarithm of the peak of |qdd| within a moving window so that the
-    variance within the three classes is least (Otsu). The class of each sample is then the one
-    that the schedule has there; with given intervals it is theirs, and the thresholds are those
-    that separate these intervals best.
+    variance within the three classes is minimal (Otsu). The class of each sample is then that of
+    the schedule; with given intervals it is that of the interval, and the thresholds are those
+    that best separate the intervals.
 
     Args:
-        schedule: its thresholds, swing rate and sample time are set.
+        schedule: changed in place: its thresholds, swing rate and sample time are set.
         recordings: in joint coordinates.
         motions: smoothed motion of each recording.
         joints: names of the joints.
@@ -108,15 +108,15 @@ def find_classes(
 
     Raises:
         ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
-            or intervals name what is not there.
+            or intervals name an unknown recording, joint or class.
     """
     step = _sample_time(recordings)
     schedule.set_sample_time(step)
     qdd = [torch.as_tensor(m.qdd, dtype=torch.float64) for m in motions]
     qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
-    # A swing's amplitude ratio of acceleration to velocity, its angular frequency on average.
+    # Amplitude ratio of acceleration to velocity of a swing: its mean angular frequency.
     rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
-    # In the words of the status of the fit, which repeats them.
+    # Worded for the status of the fit, which repeats them.
     notes: list[str] = []
     labels, thresholds = None, options.thresholds
     if options.intervals is not None:
@@ -138,10 +138,10 @@ def find_classes(
 
 
 def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
-    """Two thresholds that divide values into three classes of least variance (Otsu, 1979)."""
+    """Two thresholds that divide values into three classes of minimal variance (Otsu, 1979)."""
     count, edges = np.histogram(values, bins)
     centre = 0.5 * (edges[:-1] + edges[1:])
-    # Cumulative sums, so that every pair of thresholds costs the same few operations.
+    # Cumulative sums, so that every pair of thresholds needs only a few operations.
     weight = np.concatenate([[0], np.cumsum(count)]).astype(np.float64)
     moment = np.concatenate([[0], np.cumsum(count * centre)])
     i, j = np.triu_indices(bins, 1)
@@ -153,7 +153,7 @@ def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
 
     spread = between(np.zeros_like(i), i) + between(i, j) + between(j, np.full_like(j, bins))
     best = spread >= spread.max() * (1 - 1e-12)
-    # All thresholds between two clusters are equal; the middle is farthest from both.
+    # All thresholds between two clusters are equivalent; the middle is farthest from both.
     low = int(np.median(i[best]))
     same = best & (i == i[best][np.abs(i[best] - low).argmin()])
     return float(edges[i[same][0]]), float(edges[int(np.median(j[same]))])
@@ -175,7 +175,7 @@ def _by_otsu(
     """Thresholds of each joint for the peak of |qdd| within a moving window [s]."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
-    # Longer than half a swing, or every reversal would fall into the lowest class.
+    # Longer than half a swing; otherwise every reversal would fall into the lowest class.
     width = max(1, round(window / step))
     peaks = np.concatenate([maximum_filter1d(np.abs(a.numpy()), width, axis=0) for a in qdd])
     highest = np.maximum(peaks.max(0), STILL)
@@ -239,7 +239,7 @@ def _separating(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor
         row = []
         for border in range(2):
             upper = of_joint > border
-            # Both sides have the same weight, however long they lasted.
+            # Both sides have the same weight, regardless of their duration.
             wrong = above[~upper].double().mean(0).nan_to_num()
             wrong += (~above)[upper].double().mean(0).nan_to_num()
             row.append(float(grid[int(wrong.argmin())]))
@@ -248,13 +248,13 @@ def _separating(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor
 
 
 def _merged(seconds: Tensor, least: float, joints: Sequence[str], notes: list[str]) -> Tensor:
-    """Class whose coefficients each class takes, (joint, class)."""
+    """Class whose coefficients each class uses, (joint, class)."""
     rows = []
     for name, row in zip(joints, seconds.tolist(), strict=True):
         enough = [c for c, held in enumerate(row) if held >= least] or [int(np.argmax(row))]
         taken = []
         for c, held in enumerate(row):
-            # The nearest class with data, of two the one with more.
+            # The nearest class with data; of two equally near ones, the one with more.
             other = c if c in enough else min(enough, key=lambda e: (abs(e - c), -row[e]))
             taken.append(other)
             if other != c:

@@ -1,8 +1,8 @@
 """Fits of adaptive models: coefficients by class of acceleration (AFEM).
 
 During a search the classes are those of the measured motion, so the cost is smooth in the
-coefficients. Evidence says how far classes deviate from the constant law, and whether they do at
-all. What the search finds is then taken as far as it also improves simulations in which the class
+coefficients. Evidence determines how far classes deviate from the constant law, and whether they do
+at all. The result is then used to the extent that it also improves simulations in which the class
 follows the simulated motion.
 """
 
@@ -44,12 +44,12 @@ from nfriction.simulation.rollout import integrate
 logger = logging.getLogger(__name__)
 # Relative decrease of the cost that ends the search by class.
 TOLERANCE = 1e-6
-# Shares of the classes' deviations from the constant law to try, largest first.
+# Fractions of the classes' deviations from the constant law to try, largest first.
 SHARES = (1.0, 0.5, 0.25)
-# Widths of the classes' prior among which evidence chooses, in units of `prior_sd`: each is as
-# likely beforehand. At the first one the classes are the constant law.
+# Widths of the classes' prior among which evidence chooses, in units of `prior_sd`, all equally
+# likely a priori. With the narrowest the classes equal the constant law.
 NARROWEST, WIDTHS = 1e-4, (1 / 256, 1 / 64, 1 / 16, 1 / 4, 1.0)
-# Of a coefficient that is zero and has no scale [SI].
+# For a coefficient that is zero and has no scale [SI].
 LEAST_SD = 1e-9
 STOPPED = "Stopped before the classes were found"
 OPTIONS = FitOptions(windows=(0.5, 2.0))
@@ -68,22 +68,22 @@ def fit_adaptive(
 ) -> FitResult:
     """Fit a model whose coefficients depend on the class of acceleration.
 
-    As `nfriction.fit` does, with options for the classes. The constant law is fitted first. Every
-    class starts there and is pulled toward it, as strongly as evidence favours, so a class with few
-    data stays there. The constant coefficients are kept where classes gain too little evidence, or
-    where the result simulates the training windows no better, with the class following the
+    Like `nfriction.fit`, with options for the classes. The constant law is fitted first. Every
+    class starts there and is pulled toward it as strongly as evidence favours, so a class with few
+    data stays there. The constant coefficients are kept if classes gain too little evidence, or if
+    the result does not simulate the training windows better with the class following the
     simulation.
 
     Args:
         model: the model to fit; changed in place.
         plant: the mechanism as given.
         recordings: one or several.
-        options: see `nfriction.fit`; the last window is that of the classes.
-        classes: how the classes are found, and how far they may deviate from the constant law.
+        options: see `nfriction.fit`; the last window length is used for the classes.
+        classes: how classes are found, and how far they may deviate from the constant law.
         start, motions, callback: see `nfriction.fit`.
 
     Returns:
-        The fit; read `converged` and `status`.
+        The fit; check `converged` and `status`.
 
     Raises:
         ValueError: if recordings and plant do not match, the motion has no classes, or the model
@@ -99,7 +99,7 @@ def fit_adaptive(
 
 
 def like_start(options: FitOptions, start: FitResult | None) -> FitOptions:
-    """Options that take a start with the encoder offsets that it found, or none."""
+    """Options that match a start in having encoder offsets or none."""
     if start is None:
         return options
     reference: EncoderReference = "per_recording" if start.encoder_offsets else "shared"
@@ -111,7 +111,7 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     schedule = task.model.schedule
     if not isinstance(schedule, Adaptive):
         raise ValueError(f"{type(task.model).__name__} is no adaptive model; use `fit`.")
-    # The classes have no encoder eccentricity.
+    # Fits by class do not include encoder eccentricity.
     options = replace(task.options, eccentricity="off")
     task = replace(task, options=options)
     constant = constant_start(task)
@@ -135,7 +135,7 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
         return by_class.kept(STOPPED, converged=False)
     if not gain > options.evidence_gain:
         return by_class.kept(f"By evidence classes gain too little ({gain:.2g} nats)")
-    # Beside the law's error as noise, the prior would outweigh what classes explain.
+    # With the law's error as noise, the prior would outweigh what classes explain.
     least = max(effective_noise(end.residuals), options.min_noise)
     if least < noise:
         end = fitter.likeliest(windows, least, vector, prior, name)[0] or end.as_stopped()
@@ -145,10 +145,10 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
 
 
 class GivenClasses(Adaptive):
-    """A table by class whose class takes the place of the acceleration.
+    """A table by class whose input is the class instead of the acceleration.
 
     Args:
-        model: the model whose law and joints are taken.
+        model: the model whose law and joints are used.
         reference: constant coefficients toward which every class is pulled, (joint, coefficient).
         sd: standard deviation around them, (joint, coefficient).
     """
@@ -186,7 +186,7 @@ class GivenClassesProblem(ShootingProblem):
 
     def _integrate(self, plant: Plant, model: FrictionModel, inputs: RolloutInputs) -> Rollout:
         classes = along(self.windows, self.classes).repeat_interleave(self.substeps, 1)
-        # The schedule reads the class in place of the acceleration; velocity does not enter.
+        # The schedule reads the class instead of the acceleration; velocity is not used.
         measured = torch.zeros_like(classes), classes
         motion = integrate(plant, model, replace(inputs, measured=measured))
         # The derivatives of a step must be taken at the input that drove it.
@@ -202,7 +202,7 @@ class ClassFitter(ShootingFitter):
     def problem(
         self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
     ) -> GivenClassesProblem:
-        """The problem of windows that starts at these friction parameters."""
+        """The shooting problem of windows, started from these friction parameters."""
         posed = super().problem(windows, noise, friction, stride=stride)
         own = {f.name: getattr(posed, f.name) for f in fields(posed)}
         return GivenClassesProblem(**own, classes=self.classes)
@@ -212,8 +212,8 @@ class ClassFitter(ShootingFitter):
     ) -> tuple[HorizonResult | None, float]:
         """The search at the width of the prior that evidence favours; None if stopped.
 
-        And the gain in log evidence over the constant law, of all widths together [nats]: the best
-        of several always seems to gain.
+        Also returns the gain in log evidence over the constant law [nats], averaged over all
+        widths, since the best of several always seems to gain.
         """
         (mean, sd), x = prior, None
         ends, evidence = [], []
@@ -233,7 +233,7 @@ class ClassFitter(ShootingFitter):
 
 
 def along(windows: Windows, classes: Sequence[Tensor]) -> Tensor:
-    """Class that drives every step of windows, (window, step, joint)."""
+    """Class that determines every step of windows, (window, step, joint)."""
     driving = torch.zeros_like(windows.tau)
     for w, (place, first, last) in enumerate(windows.spans):
         driving[w, : last - first] = classes[place][first:last]
@@ -246,12 +246,12 @@ class PositionError:
 
     Args:
         plant, friction: the mechanism and its friction, whose schedule is overwritten and restored.
-        windows: what was measured, with the states from which simulations start.
+        windows: measured positions, with the states from which simulations start.
         measurement: matrix (joint, joint) from joint coordinates to those of the recording.
         substeps: integration steps per sample.
         drive: class of every sample (window, step, joint), instead of that of the simulation.
-        memory: of the coefficients at the start of each window, (window, joint, state_size).
-        threads: candidates are divided among this many.
+        memory: hidden state at the start of each window, (window, joint, state_size).
+        threads: number of threads among which candidates are divided.
     """
 
     plant: Plant
@@ -269,7 +269,7 @@ class PositionError:
         return int(self.windows.weight.sum()) * self.windows.q0.shape[1]
 
     def rms(self, residuals: Tensor) -> float:
-        """Root mean square of errors as of `residuals` [rad]."""
+        """Root mean square of errors returned by `residuals` [rad]."""
         return float((residuals.square().sum() / self.values).sqrt())
 
     def residuals(self, vector: Tensor) -> Tensor:
@@ -296,7 +296,7 @@ class PositionError:
             of.q0[w], of.qd0[w], of.tau[w], of.step[w], self.substeps, measured, memory
         )
         batch = [state.expand(len(vectors), -1) for state in (inputs.q0, inputs.qd0)]
-        # All candidates of a window in one call; without a compiler one after the other.
+        # All candidates of a window in one call; without a compiler, one after another.
         system = System.of(self.plant, self.friction)
         moved = replace(inputs, q0=batch[0], qd0=batch[1])
         states = integrate_compiled(system, moved, "auto", self.threads, parameters)
@@ -306,7 +306,7 @@ class PositionError:
         return torch.stack([run.q for run in runs])
 
     def _set_to_each(self, vectors: Tensor) -> Iterator[None]:
-        """Set the schedule to each vector in turn, in the end to what it was."""
+        """Set the schedule to each vector in turn, and restore it at the end."""
         schedule = self.friction.schedule
         before = schedule.parameter_vector()
         for vector in vectors:
@@ -320,12 +320,12 @@ class ClassFit:
     """An adaptive model to be fitted, with the classes of its recordings.
 
     Attributes:
-        task: the fit, without the encoders' offsets.
+        task: the fit, with encoder offsets removed.
         motions: of the recordings, as recorded.
         constant: fit of the constant law, from which every class starts.
         classes, windows: of the recordings.
         schedule: of the model to be fitted, set to these classes.
-        table, given: the coefficients that a fit with given classes varies, and their model.
+        table, given: the coefficients varied by a fit with given classes, and their model.
     """
 
     task: FitTask
@@ -357,23 +357,23 @@ class ClassFit:
         values = constant.model.schedule.coefficient_sets()["always"]
         natural = coefficient_scale(model, constant.plant, joint, motions)
         sd = options.prior_sd * torch.maximum(values.abs(), natural)
-        # Where neither gives a size, the coefficient is that of the law.
+        # If neither gives a scale, the coefficient stays that of the law.
         table = GivenClasses(model, values, sd.clamp_min(LEAST_SD))
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
-        # Windows are compared in joint coordinates, without what the encoders are off by.
+        # Windows are compared in joint coordinates, without encoder offsets.
         corrected = replace(task, recordings=joint, motions=motions)
         windows = cut_windows(joint, motions, length)
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property
     def driving(self) -> tuple[Tensor, ...]:
-        """Class that drives each sample of a recording, one with too few data as its neighbour."""
+        """Class at each sample of a recording; a class with too few data becomes its neighbour."""
         stands_for = self.classes.stands_for
         joints = torch.arange(len(stands_for))
         return tuple(stands_for[joints, known].double() for known in self.classes.labels)
 
     def backtracked(self, found: FitResult, windows: Windows, baseline: float) -> FitResult:
-        """The fit `found` as far as it improves on `baseline` [rad], the constant law's error.
+        """As much of the fit `found` as improves on `baseline` [rad], the constant law's error.
 
         Windows start at the states that the fit found.
         """
@@ -389,12 +389,12 @@ class ClassFit:
         longest = max(r.longest_step for r in task.recordings)
         steps = integration_substeps(task.plant, self.given, longest)
         error = PositionError(found.plant, model, windows, task.measurement, steps, memory=memory)
-        # As recorded: with the motions and the encoder offsets of the constant fit.
+        # In recorded coordinates: with the motions and encoder offsets of the constant fit.
         found = replace(
             found, model=model, motions=self.motions, encoder_offsets=constant.encoder_offsets,
             skipped_horizons=constant.skipped_horizons,
         )  # fmt: skip
-        # Given classes hide that a wrong class feeds back on the motion that chooses it.
+        # Given classes hide the feedback of a wrong class on the motion that selects it.
         for share in SHARES:
             schedule.set_coefficients(flat + share * (table - flat))
             residuals = error.residuals(schedule.parameter_vector())
@@ -407,7 +407,7 @@ class ClassFit:
         return self.kept("The classes simulate no better")
 
     def kept(self, reason: str, *, converged: bool = True) -> FitResult:
-        """The constant fit as that of the adaptive model, all classes of which are equal."""
+        """The constant fit as a fit of the adaptive model, with all classes equal."""
         flat = self.constant.model.schedule.coefficient_sets()["always"][:, None]
         self.schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
         note = f"{reason}; the constant law is kept."

@@ -36,15 +36,15 @@ from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 SearchMethod = Literal["pattern", "sqp"]
-# First mesh of a pattern search, and its factor after a poll without a better point.
+# Initial mesh of a pattern search, and its factor after a poll without a better point.
 INITIAL_MESH, CONTRACTION = 0.25, 0.5
-# Damping, relative to the curvature, of the candidates from a local quadratic.
+# Damping of the candidates from a local quadratic, relative to its curvature.
 DAMPINGS = tuple(10.0**-power for power in range(8))
-# Forward differences of a smooth simulation: half the digits.
+# Step of forward differences of a smooth simulation: half the digits.
 DIFFERENCE = 1e-6
-# Cost of a diverged candidate in a gradient, relative to the start: finite, but beyond all others.
+# Cost of a diverged candidate in a gradient, relative to the start: finite, but above all others.
 DIVERGED = 1e6
-# Lower bound of a logarithmic variable, in place of zero.
+# Lower bound of a logarithmic variable, instead of zero.
 TINY = 1e-300
 CONVERGED = "No poll point is better and the mesh is as fine as asked for."
 LIMIT = "The limit of evaluations was reached."
@@ -53,7 +53,7 @@ STOPPED = "Stopped by the callback or by an interrupt; the best point found is k
 
 @dataclass(frozen=True)
 class SearchState:
-    """An unfinished search in plain types, ready for JSON, to resume it.
+    """An unfinished search in plain, JSON-compatible types, from which it can be resumed.
 
     A pattern search continues bit for bit; SQP restarts at the best point.
 
@@ -61,7 +61,7 @@ class SearchState:
         method: `"pattern"` or `"sqp"`.
         point: best point, in the search's coordinates (see `Box`).
         value: its cost; infinite before the first evaluation.
-        evaluations, iterations: candidates simulated and steps made so far.
+        evaluations, iterations: numbers of candidates simulated and of iterations so far.
         mesh: mesh size of a pattern search, in the same coordinates.
         step: last successful move of a pattern search; zero if the last poll found nothing.
     """
@@ -82,13 +82,13 @@ class SearchOptions:
     Attributes:
         method: `"pattern"` search or `"sqp"`.
         horizon: length of the simulated windows [s], restarted from the smoothed motion; None
-            simulates each recording in one run, as the papers do. After seconds of chaotic motion
-            that is a criterion of luck.
-        max_evaluations: limit of candidates simulated.
+            simulates each recording in one run, as in the papers. After seconds of chaotic motion
+            the outcome of that is a matter of luck.
+        max_evaluations: limit on simulated candidates.
         tolerance: change relative to the scales (pattern) or the cost (SQP) that ends the search.
-        seed: of the pattern's rotations.
-        threads: candidates are divided among this many; all processors by default.
-        state: of an earlier search, to resume it.
+        seed: for the rotations of the pattern.
+        threads: number of threads for the candidates; all processors by default.
+        state: state of an earlier search to resume.
 
     Raises:
         ValueError: if there is no such method, or the tolerance is not positive.
@@ -113,7 +113,7 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Outcome of a search: the best vector, its cost, and in words why the search ended there."""
+    """Outcome of a search: the best vector, its cost, and the reason for termination in words."""
 
     vector: Tensor
     value: float
@@ -124,11 +124,11 @@ class SearchResult:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """The variables of a search, and their map to coordinates of order 1 in which it works.
+    """The variables of a search, and their map to its internal coordinates of order 1.
 
     Attributes:
-        start, lower, upper: (parameter,); equal bounds keep a parameter as it is.
-        scale: a change that counts as large; in decades where logarithmic.
+        start, lower, upper: (parameter,); equal bounds fix a parameter.
+        scale: a typical large change; in decades if logarithmic.
         logarithmic: variables searched by their logarithm, bool; they must be positive.
 
     Raises:
@@ -175,7 +175,7 @@ class Box:
         lower = torch.where(log, lower.clamp_min(TINY), lower)
         x = points * self.scale[free]
         x = torch.where(log, 10.0**x, x).clamp(lower, upper)
-        # A variable at its bound is there to the last bit, however the logarithm is rounded.
+        # A variable at its bound is exactly there, however the logarithm is rounded.
         x = torch.where(points <= low, lower, x)
         x = torch.where(points >= high, upper, x)
         vectors = self.start.expand(*points.shape[:-1], -1).clone()
@@ -199,16 +199,16 @@ def search(
     """Minimise a cost within bounds by pattern search or sequential quadratic programming.
 
     Args:
-        cost: values (m,) of candidates (m, parameter); any that is not finite is rejected.
+        cost: values (m,) of candidates (m, parameter); values that are not finite are rejected.
         box: start, bounds and scales.
         options: method, limits and the state to resume.
-        callback: called after every iteration; True stops.
+        callback: called after every iteration; stops the search by returning True.
         residuals: of candidates (m, parameter), in parts (m, n) whose squares add up to twice the
-            cost; a pattern search then also tries steps of the quadratic that they imply.
-        negligible: relative decrease of the cost that a pattern search counts as none.
+            cost; a pattern search then also tries steps from the quadratic model of these.
+        negligible: relative decrease of the cost that a pattern search treats as zero.
 
     Raises:
-        ValueError: if the state is another search's.
+        ValueError: if the state belongs to a different search.
     """
     state, size = options.state, int(box.free.sum())
     if state is not None and (state.method, len(state.point)) != (options.method, size):
@@ -230,7 +230,7 @@ def _pattern(
     residuals: Residuals | None,
     negligible: float,
 ) -> SearchResult:
-    """Generalised pattern search, every poll one batch of candidates.
+    """Generalised pattern search; every poll is one batch of candidates.
 
     An iteration polls x ± mesh along every axis and one point beyond x along the last successful
     step. It moves to the best of these, doubles the mesh if that is better than x by more than is
@@ -262,8 +262,8 @@ def _pattern(
         while state.mesh >= finest:
             moved = residuals is not None and (state.iterations == 0 or any(state.step))
             most = poll + trials + moved * (len(start) + 1)
-            # A partial poll would depend on the limit, and a resumed search would differ from a
-            # whole one.
+            # A partial poll would depend on the limit, and a resumed search would differ from an
+            # uninterrupted one.
             if state.evaluations + most > options.max_evaluations:
                 message = LIMIT
                 break
@@ -283,9 +283,9 @@ def _pattern(
 
 
 def local_quadratic(residuals: Residuals, box: Box, x: Tensor) -> Quadratic | None:
-    """Quadratic of a cost near a point (free,) by forward differences; None where it diverges.
+    """Quadratic of a cost near a point (free,) by forward differences; None if it diverges.
 
-    As Gauss and Newton: without the residuals' own curvature.
+    A Gauss-Newton model: without second derivatives of the residuals.
     """
     # Backward at an upper bound, where forward would not move.
     step = torch.where(x + DIFFERENCE > box.ends[1], -DIFFERENCE, DIFFERENCE)
@@ -300,10 +300,10 @@ def local_quadratic(residuals: Residuals, box: Box, x: Tensor) -> Quadratic | No
 
 
 def _steps(local: Quadratic, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Shape of the polls (free, free), and the quadratic's minima within bounds (damping, free)."""
+    """Shape of the polls (free, free), and minima of the quadratic in bounds (damping, free)."""
     values, axes = torch.linalg.eigh(local.hessian)
-    # Along a valley of the cost a poll steps far, across it as little as it must: to where the
-    # squared errors are twice as large.
+    # A poll steps far along a valley of the cost and little across it: to the points where the
+    # squared errors double.
     reach = (2 * local.cost / values.clamp_min(TINY)).sqrt().clamp_max(1.0)
     inside = (low < 0) & (high > 0)
     diagonal = local.hessian.diagonal().clamp_min(TINY)
@@ -326,19 +326,19 @@ def _polled(
     negligible: float,
 ) -> SearchState:
     x, last = box.start.new_tensor(state.point), box.start.new_tensor(state.step)
-    # A generator of its own per iteration: a resumed search needs no generator state.
+    # A separate generator per iteration, so a resumed search needs no generator state.
     random = torch.Generator().manual_seed(seed * 1_000_003 + state.iterations)
     axes, triangle = torch.linalg.qr(
         torch.randn(len(x), len(x), generator=random, dtype=torch.float64)
     )
-    # The sign makes the factorisation unique, and so the rotations uniform.
+    # The sign makes the factorisation unique and thus the rotations uniformly distributed.
     axes = axes * triangle.diagonal().sign()
     low, high = box.ends
     steps, trials = state.mesh * torch.cat([axes, -axes]), axes[:0]
     if local is not None:
         shape, trials = _steps(local, low - x, high - x)
         steps = steps @ shape
-    # The direction of the last success comes first: ties then keep going the same way.
+    # The direction of the last success comes first, so ties continue in the same direction.
     steps = steps[(steps @ last).argsort(descending=True, stable=True)]
     # Projected, not rejected: a minimum at a bound is approached along it.
     candidates = (x + torch.cat([last[None], steps, trials])).clamp(low, high)
@@ -352,7 +352,7 @@ def _polled(
         value=float(values[best]) if better else state.value,
         # A direction that failed once must not be preferred.
         step=(candidates[best] - x).tolist() if better else [0.0] * len(x),
-        # A mesh beyond the range of the variables would only poll the bounds.
+        # A mesh larger than the range of the variables would only poll the bounds.
         mesh=min(2.0 * state.mesh, 1.0) if success else CONTRACTION * state.mesh,
         evaluations=state.evaluations + len(candidates),
         iterations=state.iterations + 1,
@@ -366,11 +366,11 @@ def _values(cost: Cost, box: Box, points: Tensor) -> Tensor:
 
 # SLSQP ignores the result of its callback; only an exception ends it.
 class _StoppedError(Exception):
-    """Leaves SciPy's loop."""
+    """Raised to leave SciPy's loop."""
 
 
 def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> SearchResult:
-    """SciPy's SLSQP with forward differences, every gradient one batch of candidates."""
+    """SciPy's SLSQP with forward differences; every gradient is one batch of candidates."""
     from scipy.optimize import minimize  # slow to import
 
     (lower, upper), state = box.ends, options.state
@@ -399,11 +399,11 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
         nonlocal iterations
         iterations += 1
         state = SearchState("sqp", best.tolist(), least, evaluations, iterations)
-        # SciPy limits iterations, but simulations are what takes time.
+        # SciPy limits iterations, but the simulations take the time.
         if evaluations >= options.max_evaluations or callback(state):
             raise _StoppedError
 
-    # SLSQP tests the change of one step, which is smaller than the distance to the minimum.
+    # SLSQP tests the change in one step, which is smaller than the distance to the minimum.
     settings: Any = {"ftol": 1e-2 * options.tolerance, "maxiter": 1000}
     try:
         end = minimize(
@@ -432,17 +432,17 @@ def fit_by_search(
 
     Args:
         model: a model with constant or adaptive coefficients; changed in place.
-        plant: the mechanism as given; where `start` is given, as it left it.
+        plant: the mechanism as given, or as fitted by `start` if that is given.
         recordings: one or several.
         options: method, windows and limits.
         classes: of an adaptive model, see `fit_adaptive`.
-        start: fit to start from; of the constant law for an adaptive model. By default the
+        start: fit to start from; for an adaptive model, that of the constant law. By default the
             constant coefficients that the torques imply (adaptive: the trajectory fit).
         motions: smoothed motions in joint coordinates.
         callback: called after every iteration; True stops.
 
     Returns:
-        The fit; read `converged` and `status`.
+        The fit; check `converged` and `status`.
 
     Raises:
         ValueError: if the model's coefficients are neither constant nor adaptive, or recordings
@@ -457,7 +457,7 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
-    # Constants start from the torques, which cost no simulation; classes need a motion to follow.
+    # Constants start from the torques, which needs no simulation; classes must follow a motion.
     method: Method = "output_error" if schedule.follows_motion else "equation_error"
     asked = like_start(FitOptions(method), start)
     task = prepare_task(model, plant, recordings, asked, start, motions)
@@ -483,7 +483,7 @@ def fit_by_search(
     )  # fmt: skip
     box = _box(table, varied, constant, task)
     objective = _Objective.of(error, table)
-    # The noise is that of the start, so the cost there says what counts in log likelihood.
+    # The noise is that of the start, so the cost there sets the scale of the log likelihood.
     negligible = loglik_tolerance(float(objective.cost(box.start[None])), asked)
     result = search(objective.cost, box, options, callback, objective.residuals, negligible)
     table.set_parameter_vector(result.vector)
@@ -514,7 +514,7 @@ class _Objective:
 
     Attributes:
         error: position error of candidates.
-        noise: its standard deviation by the errors of the start; those of the end are not known.
+        noise: its standard deviation, from the errors at the start; those at the end are unknown.
         mean, sd: of the prior, (parameter,).
     """
 
@@ -525,7 +525,7 @@ class _Objective:
 
     @classmethod
     def of(cls, error: PositionError, table: Tabulated) -> _Objective:
-        """The objective around the table's present values."""
+        """The objective around the current values of the table."""
         first = error.residuals(table.parameter_vector())
         return cls(error, effective_noise(first.nan_to_num(1.0, 1.0, -1.0)), *table.prior())
 
@@ -548,7 +548,7 @@ def _box(table: Tabulated, model: FrictionModel, constant: FitResult, task: FitT
     natural = natural.reshape(len(natural), *(1,) * (values.ndim - 2), -1)
     log = torch.tensor([not c.linear for c in model.law.coefficients]).expand_as(values)
     scale = torch.maximum(values.abs(), natural)
-    # A coefficient that is searched over decades moves by one of them.
+    # A logarithmic coefficient has a scale of one decade.
     scale = torch.where(log | (scale == 0), 1.0, scale)
     lower, upper = table.bounds()
     return Box(table.parameter_vector(), lower, upper, scale.reshape(-1), log.reshape(-1))

@@ -1,1 +1,1 @@
-"""Control of the papers' rig: their future work."""
+"""Control of the papers' rig, which they name as future work."""

@@ -15,19 +15,19 @@ from nfriction.plant import PendulumChain
 
 Array = NDArray[np.float64]
 Compensation = Callable[[Array, Array, Array], Array]
-"""Friction torque of every joint [N m] at qd, qdd and load, all (*batch, joint)."""
+"""Friction torque of every joint [N m] as a function of qd, qdd and load, all (*batch, joint)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """A plant near a motion, sampled: x[k + 1] = A x[k] + B dtau[k], x = (q - q0, qd - qd0).
+    """A discrete-time plant near a motion: x[k + 1] = A x[k] + B dtau[k], x = (q - q0, qd - qd0).
 
     Attributes:
         a: (*batch, 2 joint, 2 joint).
         b: (*batch, 2 joint, joint).
         q0, qd0: the motion [rad, rad/s], (*batch, joint).
-        acceleration: qdd of the motion, (*batch, joint), and its slopes by x and by tau, (*batch,
-            joint, 2 joint) and (*batch, joint, joint).
+        acceleration: qdd of the motion, (*batch, joint), and its derivatives by x and by tau,
+            (*batch, joint, 2 joint) and (*batch, joint, joint).
     """
 
     a: Array
@@ -46,7 +46,7 @@ class LinearPlant:
 def linearise(
     plant: PendulumChain, q: Tensor, qd: Tensor, tau: Tensor, sample_time: float
 ) -> LinearPlant:
-    """The plant without friction near a motion, exactly discretised with the torque held.
+    """The frictionless plant near a motion, exactly discretised with zero-order hold of the torque.
 
     Args:
         plant: the mechanism.
@@ -78,8 +78,8 @@ class Weights:
 
     Attributes:
         state: diagonal of Q in the cost sum x'Qx + tau_1^2, (2 joint,).
-        torque_noise: standard deviation of unknown torques at every joint, a sample each [N m].
-        position_noise: of the encoders [rad].
+        torque_noise: standard deviation per sample of unknown torques at every joint [N m].
+        position_noise: standard deviation of the encoders [rad].
     """
 
     state: Array
@@ -92,7 +92,7 @@ class Gains:
     """Gains of feedback and of the Kalman filter at one sample.
 
     Attributes:
-        linear: the plant there.
+        linear: the linear plant at this sample.
         feedback: K of dtau_1 = -K x, (2 joint,).
         observer: L of x += L (q_measured - q_predicted), (2 joint, joint).
         torque: of the first joint without feedback [N m].
@@ -105,10 +105,10 @@ class Gains:
 
 
 def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
-    """Steady gains at an equilibrium; the first joint alone has a drive.
+    """Steady-state gains at an equilibrium; only the first joint has a drive.
 
     Raises:
-        ValueError: if the plant does not stay there at rest.
+        ValueError: if the plant is not in equilibrium there.
 
     References:
         Discrete algebraic Riccati equation (`scipy.linalg.solve_discrete_are`).
@@ -120,7 +120,7 @@ def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
     n, b = len(linear.q0), linear.b[:, :1]
     p = solve_discrete_are(linear.a, b, np.diag(weights.state), np.eye(1))
     process, noise, c = _noise(linear, weights)
-    # The floor keeps the equation regular.
+    # The small term keeps the equation regular.
     e = solve_discrete_are(linear.a.T, c.T, process + 1e-18 * np.eye(2 * n), noise)
     return Gains(linear, _feedback(linear, p), _observer(e, c, noise))
 
@@ -132,7 +132,7 @@ def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weig
         way: the plant along the motion, (sample, ...).
         torque: of the first joint along it [N m], (sample,).
         top: the plant at its end.
-        weights: of both filters.
+        weights: of regulator and Kalman filter.
 
     References:
         Riccati recursions, backward for the feedback, forward for the Kalman filter.
@@ -145,7 +145,7 @@ def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weig
         at = way[k]
         feedback.append(_feedback(at, p))
         p = np.diag(weights.state) + at.a.T @ p @ (at.a - np.outer(at.b[:, 0], feedback[-1]))
-        # Rounding would grow over thousands of samples.
+        # Asymmetry from round-off would grow over thousands of samples.
         p = 0.5 * (p + p.T)
     e = weights.position_noise**2 * np.eye(len(p))
     for k in range(len(torque)):
@@ -170,32 +170,32 @@ def _observer(covariance: NDArray[Any], c: Array, noise: Array) -> Array:
 
 
 def _noise(linear: LinearPlant, weights: Weights) -> tuple[Array, Array, Array]:
-    """Covariances of the state's unknown change and of the encoders, and the matrix between."""
+    """Covariances of process and encoder noise, and the measurement matrix."""
     n = len(linear.q0)
     process = weights.torque_noise**2 * linear.b @ linear.b.T
     return process, weights.position_noise**2 * np.eye(n), np.eye(n, 2 * n)
 
 
 def still(_: float) -> tuple[float, float]:
-    """Reference of an arm that is to stay where it is."""
+    """Reference for an arm that should stay where it is."""
     return 0.0, 0.0
 
 
 class Feedback:
-    """Linear-quadratic feedback to an equilibrium, from afar along a planned motion.
+    """Linear-quadratic feedback to an equilibrium, from a distance along a planned motion.
 
     A Kalman filter estimates the state from encoder positions; at the equilibrium the arm follows a
-    reference. The torque is tau_1 = tau_plan - K (x - x_ref) + g tau_f, with the friction torque
-    tau_f that a model gives at the estimated motion. Joints after the first have no drive, so their
+    reference. The torque is tau_1 = tau_plan - K (x - x_ref) + g tau_f, where tau_f is a model's
+    friction torque at the estimated motion. Joints after the first have no drive, so their
     friction remains.
 
     Args:
-        plant: the mechanism, its first joint driven.
+        plant: the mechanism, whose first joint is driven.
         top: gains at the equilibrium.
-        way: gains along the motion that leads there, one a sample; none starts at the equilibrium.
-        reference: angle of the arm and its rate over time [rad, rad/s].
-        compensation: gives the friction torque; None for none.
-        share: g.
+        way: gains along the motion to it, one per sample; if empty, it starts at the equilibrium.
+        reference: angle and velocity of the arm over time [rad, rad/s].
+        compensation: gives the friction torque; None for no compensation.
+        share: g, compensated fraction.
     """
 
     def __init__(
@@ -240,6 +240,6 @@ class Feedback:
             load = self.plant.load(torch.as_tensor(q), torch.as_tensor(qd)).numpy()
             friction = self.compensation(qd, qdd, load)[..., 0]
         torque[..., 0] = now.torque + feedback + self.share * friction
-        # Compensation is there to cancel friction: the filter predicts what is left.
+        # Compensation cancels friction, so the filter predicts with the remainder.
         self.net[..., 0] = feedback + (self.share - 1.0) * friction
         return torque

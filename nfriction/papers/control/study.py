@@ -1,12 +1,12 @@
 """Control of the papers' rig on its driven arm with friction compensation by each class of model.
 
-A single link is balanced upright; models are fitted to driven recordings of it hanging, then
-compensate the friction of the arm, the only joint with a motor. All three links are swung up and
-balanced as well: there the noise of encoder counts moves the arm by more than friction does.
+A single link is balanced upright; models are fitted to driven recordings of the hanging link, and
+then compensate the friction of the arm, the only joint with a motor. All three links are also swung
+up and balanced: there, the noise of encoder counts moves the arm by more than friction does.
 
-The rig is the RTIP twin's with its arm free and ball bearings at all links: with the twin's bushing
-at the last one, linear feedback on encoder counts loses the links. The true friction belongs to no
-class that is fitted.
+The rig is that of the RTIP twin with its arm free and ball bearings at all links: with the twin's
+bushing at the last link, linear feedback on encoder counts cannot hold the links. The true friction
+is not in any of the fitted model classes.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ MODELS = ("NCFM", "LFM", "NLFM", "Stribeck", "ALFM", "NFLFM")
 NONE, TRUTH, SHARED = "none", "true friction", "LFM"
 THINNED = 10  # one sample of this many is kept for figures
 SHARES = (0.5, 0.8, 1.2)
-"""Shares of the friction torque compensated, beside all of it."""
-# The arm's motor and slip ring: dry friction (independent of load, and by it), Stribeck's rise and
-# velocity, asymmetry, viscous friction and the velocity from which it thins. A choice of ours.
+"""Compensated fractions of the friction torque, in addition to full compensation."""
+# The arm's motor and slip ring: dry friction (independent of and proportional to load), Stribeck's
+# rise and velocity, asymmetry, viscous friction and the velocity above which it thins. Our choice.
 ARM = (0.12, 0.03, 0.4, 0.2, 0.06, 0.05, 4.0)
 ELECTRONICS = Electronics(counts=4 * Encoder().lines, delay=1, torque_limit=20.0, torque_bits=16)
 # Weights of the arm and of each link in the linear-quadratic cost: angle and rate.
 ARM_WEIGHT, LINK_WEIGHT = (10.0, 1.0), (100.0, 1.0)
-TORQUE_NOISE = 0.1  # unknown torques for the Kalman filter [N m]
+TORQUE_NOISE = 0.1  # SD of unknown torques for the Kalman filter [N m]
 AMPLITUDE, FREQUENCY = 0.3, 0.1  # of the arm's reference [rad, Hz]
 SAMPLE_TIME = ELECTRONICS.sample_time
 WINDOWS = (0.5,)  # of fits that simulate [s]
@@ -93,9 +93,9 @@ _HIDDEN = Law(
 
 
 def true_friction(plant: PendulumChain) -> FrictionModel:
-    """The friction of the simulated rig; the twin's own, with the papers' load for the bearing's.
+    """The friction of the simulated rig: the twin's, with the papers' load for bearing forces.
 
-    The force that a bearing carries, which the twin takes, is no input of a friction model here.
+    The force that a bearing carries, as used by the twin, is not an input of a friction model.
     """
     twin = replace(
         SPECIFICATIONS["rtip"].friction, seal=(8e-4,) * 3, bearing_arm=(5e-5,) * 3,
@@ -116,7 +116,7 @@ def true_friction(plant: PendulumChain) -> FrictionModel:
 def driven_recordings(
     plant: PendulumChain, friction: FrictionModel, *, count: int, seconds: float, seed: int = 0
 ) -> list[Recording]:
-    """Recordings of the hanging rig with a random multisine of torque at the arm."""
+    """Recordings of the hanging rig with a random multisine torque at the arm."""
     random = np.random.default_rng(seed)
     steps = round(seconds * 1000)
     time = np.arange(steps + 1) / 1000
@@ -126,7 +126,7 @@ def driven_recordings(
         phase = random.uniform(0, 2 * np.pi, len(frequency))
         tau = np.zeros((steps + 1, plant.joints))
         tau[:, 0] = 0.9 * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
-        # From hanging, since motion about the top would need a controller while it is recorded.
+        # From hanging, since motion about upright would need a controller during the recording.
         hanging = torch.zeros(plant.joints, dtype=torch.float64)
         hanging[1] = math.pi
         run = rollout(plant, friction, hanging, torch.zeros_like(hanging), torch.tensor(tau[:-1]),
@@ -154,13 +154,13 @@ def fitted_model(
 
 
 def compensation_of(model: FrictionModel) -> Compensation:
-    """Friction torque of a model, sample by sample, compiled; classes advance with the samples."""
+    """Compiled friction torque of a model, sample by sample; classes advance with each sample."""
     example = torch.zeros(model.joints, dtype=torch.float64)
     schedule = model.schedule
     memory: list[Array] = []
 
     def step(qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        # The class of this sample first: a step later it would lag each change of direction.
+        # The class of this sample first; otherwise it would lag each change of direction by a step.
         following = schedule.advance(qd, qdd, state)
         return model.torque(qd, load, schedule.coefficients_from(qd, qdd, following)), following
 
@@ -179,13 +179,13 @@ def compensation_of(model: FrictionModel) -> Compensation:
 
 
 def reference(time: float) -> tuple[float, float]:
-    """Angle and rate of the arm that the balance follows: slow, so that friction matters most."""
+    """Reference angle and velocity of the arm: slow, so that friction matters most."""
     w = 2.0 * math.pi * FREQUENCY
     return AMPLITUDE * math.sin(w * time), AMPLITUDE * w * math.cos(w * time)
 
 
 def weights(joints: int) -> Weights:
-    """Weights of both filters; the encoders' noise is that of their counts."""
+    """Weights of regulator and Kalman filter; the encoder noise is that of counts."""
     state = np.array([ARM_WEIGHT, *[LINK_WEIGHT] * (joints - 1)]).T.reshape(-1)
     return Weights(state, TORQUE_NOISE, 2.0 * math.pi / (4 * Encoder().lines) / math.sqrt(12.0))
 
@@ -199,7 +199,7 @@ def top_gains(plant: PendulumChain) -> Gains:
 def way_up(plant: PendulumChain, friction: FrictionModel | None) -> list[Gains]:
     """Gains along a swing-up from hanging that is planned with a model's friction.
 
-    Their torque lacks the friction of the arm, which is compensated as it moves.
+    Their torque does not include the friction of the arm, which is compensated during the motion.
     """
     plan = plan_swing_up(plant, friction, sample_time=SAMPLE_TIME)
     q, qd = torch.tensor(plan.q), torch.tensor(plan.qd)
@@ -223,12 +223,12 @@ def controlled(
     *,
     seconds: float,
 ) -> dict[str, ControlledMotion]:
-    """Motions of the rig with its true friction, one for each controller, side by side.
+    """Motions of the rig with its true friction, one per controller, simulated together.
 
     Args:
         plant, friction: the rig and its true friction.
-        controllers: by name; all with a swing-up of the same length, or all without.
-        seconds: length of the motion upright.
+        controllers: by name; all with a swing-up of the same duration, or all without.
+        seconds: duration of the upright motion.
     """
     each = list(controllers.values())
 
@@ -250,17 +250,17 @@ def controlled(
 
 
 def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[str, float]:
-    """Figures of a balanced motion after it has settled.
+    """Performance of a balanced motion after it has settled.
 
     Args:
-        run: of `controlled`.
-        follow: its arm follows `reference`.
-        settled: from here on [s].
+        run: result of `controlled`.
+        follow: whether its arm follows `reference`.
+        settled: time from which it is evaluated [s].
 
     Returns:
         Tracking error of the arm and its largest excursion from the reference, largest angle of a
         link from upright, mean power of the motor and root mean square of its torque; infinite
-        where the links fell.
+        if the links fell.
     """
     late = run.time >= settled
     asked = np.array([reference(t)[0] if follow else 0.0 for t in run.time[late].tolist()])
@@ -274,7 +274,7 @@ def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[
         "power [W]": float(np.mean(np.abs(torque * rate))),
         "torque [N m]": float(np.sqrt(np.mean(torque**2))),
     }
-    # A rig that fell has no tracking error worth a comparison.
+    # The tracking error of a rig that fell is meaningless.
     fallen = not math.isfinite(found["largest tilt [mrad]"]) or links.max() > 0.5 * math.pi
     return dict.fromkeys(found, math.inf) if fallen else found
 
@@ -290,13 +290,13 @@ def run_study(
 
     Args:
         single, three: models fitted to the rig of `true_friction` with one link and with three, by
-            name; for a single link shares of the torque of `SHARED` are tried as well.
-        seconds, settled: length of each motion upright, and from where on it counts [s].
+            name; for a single link, fractions of the torque of `SHARED` are also tried.
+        seconds, settled: duration of each upright motion, and start of its evaluation [s].
 
     Returns:
-        `performance` by task ("still", "follow", "swing-up", "three links") and compensation, None
-        for infinity; and thinned motions for figures. With the swing-up, which is planned with the
-        friction of the model, also the largest deviation of a link from the plan; a model with
+        `performance` by task ("still", "follow", "swing-up", "three links") and compensation, with
+        None for infinity; and thinned motions for figures. For the swing-up, planned with the
+        friction of the model, also the largest deviation of a link from the plan; a model for
         which no plan is found has no row.
     """
     found: dict[str, dict[str, dict[str, float | None]]] = {}
@@ -307,7 +307,7 @@ def run_study(
         follow, rows = task in ("follow", "three links"), {}
         friction = true_friction(plant)
         for name, (model, share) in _compensated(models, friction, shares=models is single).items():
-            # Made anew: an adaptive model's remembers the motion before.
+            # Created anew, because that of an adaptive model remembers the previous motion.
             given = model and compensation_of(model)
             way: Sequence[Gains] = ()
             if task == "swing-up":
@@ -337,7 +337,7 @@ def run_study(
 def _compensated(
     models: Mapping[str, FrictionModel], friction: FrictionModel, *, shares: bool
 ) -> dict[str, tuple[FrictionModel | None, float]]:
-    """Models and shares of their torque that are compensated, by name."""
+    """Models and compensated fractions of their torque, by name."""
     rows: dict[str, tuple[FrictionModel | None, float]] = {NONE: (None, 0.0)}
     rows |= {name: (model, 1.0) for name, model in models.items()}
     if shares and SHARED in models:
@@ -346,7 +346,7 @@ def _compensated(
 
 
 def single_link() -> PendulumChain:
-    """The rig with its first link alone."""
+    """The rig with only its first link."""
     whole = rigs.rtip("free").to_dict()
     first = {key: whole[key][:1] for key in ("mass", "length", "com", "inertia")}
     return PendulumChain(
@@ -356,7 +356,7 @@ def single_link() -> PendulumChain:
 
 
 def balance_figure(motions: Mapping[str, Array]) -> Figure:
-    """Arm and tilt of the links while the arm follows its reference, a line a compensation."""
+    """Arm and tilt of the links as the arm follows its reference, one line per compensation."""
     shown = {n: motions[f"follow, {n}"] for n in (NONE, SHARED, TRUTH) if f"follow, {n}" in motions}
     figure, axes = style.panels(2, 1, style.PAGE, 3.6, sharex=True)
     looks = style.looks(shown)

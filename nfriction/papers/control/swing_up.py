@@ -1,4 +1,4 @@
-"""Swing-up of links by the arm alone: a torque over time, found by multiple shooting."""
+"""Swing-up of links using only the arm: a torque over time, found by multiple shooting."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nfriction.simulation.validate import required_substeps
 
 Array = NDArray[np.float64]
 
-# A gap of the planned motion costs this much more than a torque of the same size relative to its
-# scale, so that what remains of the gaps is far below an encoder count.
+# Weights of gaps in the planned motion and of the torque, both relative to their scales, such that
+# the remaining gaps are far below an encoder count.
 GAP, TORQUE = 300.0, 0.02
 RATE_SCALE, TORQUE_SCALE = 5.0, 10.0  # [rad/s, N m]
-CLOSED = 5e-4  # largest gap of a found plan, below the papers' encoder count [rad; 5 rad/s]
+CLOSED = 5e-4  # largest gap of an accepted plan, below the papers' encoder count [rad; 5 rad/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Plan:
     """A motion from hanging to upright.
 
     Attributes:
-        q, qd: at every sample but the last, which is upright and at rest [rad, rad/s],
+        q, qd: at every sample except the last, which is upright and at rest [rad, rad/s],
             (sample, joint).
         tau: of the first joint, held over each sample [N m], (sample,).
     """
@@ -48,20 +48,20 @@ def plan_swing_up(
     sample_time: float = 1e-3,
     max_steps: int = 400,
 ) -> Plan:
-    """Find a torque of the arm that lifts all links from hanging to rest upright.
+    """Find an arm torque that swings all links up from hanging to rest upright.
 
     Multiple shooting: the states between windows and the torque, linear over each window, are the
     unknowns of a nonlinear least-squares problem whose residuals are the gaps between windows and,
     with a small weight, the torque. The search starts from a straight line between the two poses.
 
     Args:
-        plant: a chain on a free arm, which alone has a drive.
-        friction: of the plan; None for none.
-        seconds: length of the motion.
-        windows: it is divided into.
-        torque_limit: of the plan [N m]; feedback needs the rest of what the drive has.
-        sample_time: over which a torque is held [s].
-        max_steps: of the solver.
+        plant: a chain on a free arm; only the arm has a drive.
+        friction: assumed in the plan; None for none.
+        seconds: duration of the motion.
+        windows: number of shooting windows.
+        torque_limit: of the plan [N m]; feedback needs the remaining torque of the drive.
+        sample_time: time over which a torque is held [s].
+        max_steps: limit on steps of the solver.
 
     Raises:
         ValueError: if no such motion was found.
@@ -96,7 +96,7 @@ def plan_swing_up(
 
 @dataclass(frozen=True, eq=False)
 class _Shooting:
-    """Residuals of a plan and their slopes by x: states between windows, then torques."""
+    """Residuals of a plan and their derivatives by x: states between windows, then torques."""
 
     plant: PendulumChain
     friction: FrictionModel | None
@@ -111,7 +111,7 @@ class _Shooting:
 
     @property
     def inner(self) -> int:
-        """Entries of x that are states."""
+        """Number of entries of x that are states."""
         return (self.windows - 1) * self.size
 
     @property
@@ -154,12 +154,12 @@ class _Shooting:
         return np.concatenate([GAP * gaps.ravel(), self.effort * x[self.inner :]])
 
     def slopes(self, x: Array) -> Array:
-        """Derivatives of the residuals by x, a row a residual."""
+        """Derivatives of the residuals by x, one row per residual."""
         size, windows, inner = self.size, self.windows, self.inner
         nodes, tau = self.split(x)[0][:-1] / self.scale, x[inner:, None]
         given = np.concatenate([nodes, tau[:-1], tau[1:]], -1)
         units = np.concatenate([self.scale, [TORQUE_SCALE, TORQUE_SCALE]])
-        # Central differences of every window by all that it depends on, in one batch.
+        # Central differences of every window by all of its variables, in one batch.
         shift = 1e-6 * np.concatenate([np.eye(size + 2), -np.eye(size + 2)])
         near = (given + shift[:, None]).reshape(-1, size + 2) * units
         ends = self.moved(near[:, :size], near[:, size], near[:, size + 1])[0][:, -1] / self.scale

@@ -1,7 +1,7 @@
 """Evolutionary tuning of a fuzzy controller: ranges and rules, error against number of rules.
 
-Differential evolution (SciPy) moves the universes of inputs and outputs, the term that each rule
-gives, and leaves rules out. The paper names evolutionary algorithms as its future work.
+Differential evolution (SciPy) varies the universes of inputs and outputs and the term that each
+rule gives, and omits rules. The paper names evolutionary algorithms as its future work.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class TorqueSamples:
     Attributes:
         qd, qdd, load: velocity [rad/s], acceleration [rad/s^2] and normal load [-], (sample,).
         torque: friction torque [N m], (sample,).
-        block: consecutive samples whose errors are averaged. The torque of a smoothed motion has
-            the noise of its acceleration, which may exceed friction; averages remove most of it.
+        block: consecutive samples over which errors are averaged. The torque of a smoothed motion
+            contains acceleration noise, which may exceed friction; averaging removes most of it.
     """
 
     qd: Tensor
@@ -51,15 +51,15 @@ class EvolutionOptions:
     """Settings of an evolution.
 
     Attributes:
-        prices: a run for each: price of all rules, as a share of the error of the given controller.
-        population: candidates at a time.
-        generations: of each run.
-        seed: of everything.
-        checkpoint: file that keeps every finished generation; a run that finds one of the same
-            settings goes on there. None for none.
+        prices: price of all rules in each run, as a fraction of the error of the given controller.
+        population: number of candidates.
+        generations: number per run.
+        seed: for all random numbers.
+        checkpoint: file that stores every finished generation; a run that finds one with the same
+            settings resumes from it. None for no checkpoint.
 
     Raises:
-        ValueError: if there is no price, or the population is smaller than SciPy's least of 5.
+        ValueError: if there is no price, or the population is below SciPy's minimum of 5.
     """
 
     prices: tuple[float, ...] = (0.0, 0.1, 0.3, 1.0)
@@ -94,16 +94,16 @@ def evolve(
     options: EvolutionOptions = EvolutionOptions(),
     callback: Callable[[float, int], None] | None = None,
 ) -> list[Candidate]:
-    """Controllers of which none has both a smaller error and fewer rules, fewest rules first.
+    """Pareto-optimal controllers in error and number of rules, fewest rules first.
 
     Args:
         start: of |velocity| and acceleration; its outputs are the coefficients of the law. It is a
             member of the first population of every run.
         law: whose torque is compared with the samples'.
-        samples: to fit; judge the result on others.
-        v_smooth: of the law's sign [rad/s].
+        samples: to fit; test the result on others.
+        v_smooth: of the law's smooth sign [rad/s].
         options: prices of rules, effort, checkpoint.
-        callback: called with price and generation after each.
+        callback: called with price and generation after each generation.
 
     References:
         R. Storn and K. Price, J. Global Optimization 11 (1997) 341; the future work of the TLRIP
@@ -131,13 +131,13 @@ def evolve(
 
         random = np.random.default_rng([options.seed, options.prices.index(price)])
         population = random.uniform(size=(options.population, len(own)))
-        # A third of the first candidates lies near the given controller.
+        # A third of the initial candidates are near the given controller.
         near = options.population // 3
         population[:near] = np.clip(own + 0.05 * random.normal(size=(near, len(own))), 0.0, 1.0)
         population[0] = own
         done, population = kept.get(str(price), (0, population))
         for generation in range(done, options.generations):
-            # One generation a call: what is between two is all that a checkpoint needs.
+            # One generation per call, so a checkpoint only needs the population between calls.
             ended = differential_evolution(
                 cost, box, init=np.asarray(population), maxiter=1, polish=False, popsize=1,
                 seed=np.random.default_rng([options.seed, generation]), tol=0.0,
@@ -155,7 +155,7 @@ def evolve(
 
 
 def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Candidates that no other beats in error and in number of rules, fewest rules first."""
+    """Candidates that no other beats in both error and number of rules, fewest rules first."""
     front: list[Candidate] = []
     for one in sorted(candidates, key=lambda c: (c.rules, c.error)):
         if not front or one.error < front[-1].error:
@@ -177,7 +177,7 @@ def torque_error(
 
 
 def _genes_of(controller: MamdaniController) -> Array:
-    """Genes in [0, 1] of a controller as it is: no stretch, its own terms, every rule."""
+    """Genes in [0, 1] of an unchanged controller: no stretch, its own terms, every rule."""
     rules = controller.rule_base
     scales = [0.5] * (len(rules.inputs) + 2 * len(rules.outputs))
     terms = [
@@ -189,13 +189,13 @@ def _genes_of(controller: MamdaniController) -> Array:
 
 
 def _expressed(start: MamdaniController, genes: Sequence[float]) -> MamdaniController:
-    """The controller of some genes."""
+    """The controller that genes describe."""
     base = start.rule_base
     inputs, outputs, count = len(base.inputs), len(base.outputs), len(base.rules)
     factors = [STRETCH ** (2.0 * g - 1.0) for g in genes[: inputs + 2 * outputs]]
     terms = np.reshape(genes[inputs + 2 * outputs : -count], (count, outputs))
     kept = [gate >= 0.5 for gate in genes[-count:]]
-    # A controller needs a rule: the one that is nearest to being kept.
+    # A controller needs a rule; keep the one closest to being kept.
     kept[int(np.argmax(genes[-count:]))] = True
 
     def said(row: Array) -> tuple[str, ...]:
@@ -217,7 +217,7 @@ def _spread(variable: Variable, middle: float, width: float) -> Variable:
     low, high = variable.universe
     centre = 0.5 * (low + high)
     if low >= 0:
-        # A coefficient that is positive stays so.
+        # A positive coefficient stays positive.
         width = min(width, middle * centre / (centre - low))
     return _moved(variable, (middle - width) * centre, width)
 
@@ -236,7 +236,7 @@ def _moved(variable: Variable, offset: float, factor: float) -> Variable:
 
 
 def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:
-    """Generations done and their last population, by price."""
+    """Number of finished generations and last population, by price."""
     path = options.checkpoint
     if path is None or not path.exists():
         return {}
@@ -247,7 +247,7 @@ def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:
 
 
 def _described(options: EvolutionOptions) -> dict[str, object]:
-    """Options that populations depend on; more generations continue a run."""
+    """Options on which populations depend; with more generations, a run continues."""
     return {
         "prices": list(options.prices), "population": options.population, "seed": options.seed
     }  # fmt: skip

@@ -14,7 +14,7 @@ from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, rea
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 
-# MATLAB's function: our shape, and the places of our numbers in its list.
+# MATLAB's function: our shape, and the positions of our parameters in its list.
 _FUNCTIONS = {
     "gaussmf": ("gaussian", (1, 0)),
     "gauss2mf": ("two_sided_gaussian", (1, 0, 3, 2)),
@@ -28,7 +28,7 @@ _RULE = re.compile(r"([-\d\s]+),([-\d\s]+)\(([^()]*)\)\s*:\s*([12])\s*")
 
 
 class _FileVariable(NamedTuple):
-    """A variable, and the names of its sets in the file's order, by which rules refer to them."""
+    """A variable, and the names of its sets in the order of the file, to which rules refer."""
 
     variable: Variable
     terms: list[str]
@@ -56,15 +56,15 @@ def load_fis(path: str | Path, units: Sequence[str] = ("deg/s", "deg/s^2")) -> R
 def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBase:
     """Rule base from the text of a `.fis` file.
 
-    Read are Mamdani systems with min, max and centroid, and the functions gaussmf, gauss2mf,
-    gbellmf, trimf and trapmf. Sets are put in ascending order. A rule joined by OR becomes one
+    Supports Mamdani systems with min, max and centroid, and the functions gaussmf, gauss2mf,
+    gbellmf, trimf and trapmf. Sets are sorted in ascending order. A rule joined by OR becomes one
     rule for each of its conditions, which gives the same output under max.
 
     Args:
         text: of the file.
-        units: of the inputs, which the format does not contain; "1" for none.
+        units: of the inputs, which the format does not contain; "1" for dimensionless.
     Raises:
-        ValueError: no such system; names the line.
+        ValueError: if the system is not supported; the message names the line.
     """
     sections = _sections(text)
     system = sections.get("System", {})
@@ -88,19 +88,19 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
 
 
 def _sections(text: str) -> dict[str, dict[str, _Line]]:
-    """Lines by section and key; a rule's key is its number."""
+    """Lines by section and key; the key of a rule is its number."""
     sections: dict[str, dict[str, _Line]] = {}
     section: dict[str, _Line] | None = None
     heading = ""
     for number, raw in enumerate(text.splitlines(), 1):
         stripped = raw.strip()
         line = _Line(number, stripped)
-        # MATLAB's comments.
+        # Comments in MATLAB.
         if not stripped or stripped.startswith("%"):
             continue
         if stripped.startswith("[") and stripped.endswith("]"):
             heading = stripped[1:-1].strip()
-            # Reading on would mix two systems into one.
+            # Continuing would mix two systems into one.
             if heading in sections:
                 raise line.error("this section comes twice.")
             section = sections[heading] = {}
@@ -126,7 +126,7 @@ def _check_system(system: dict[str, _Line]) -> None:
     if _quoted(system["Type"]).lower() != "mamdani":
         raise system["Type"].error("only systems of type 'mamdani' are read.")
     for key, method in _METHODS.items():
-        # A missing method is the default, which is ours.
+        # A missing method means the default, which is the method here.
         if key in system and _quoted(system[key]) != method:
             raise system[key].error(f"{key} must be {method!r}.")
 
@@ -147,7 +147,7 @@ def _variables(
         low_high = _numbers(section["Range"], section["Range"].text.strip("[]"))
         if len(low_high) != 2:
             raise section["Range"].error("expected [low high].")
-        # Rules of the file count the sets in its own order.
+        # Rules in the file number the sets in its own order.
         ascending = sorted(terms, key=lambda term: term.core)
         name, universe = _quoted(section["Name"]), (low_high[0], low_high[1])
         variable = Variable(name, unit, universe, tuple(ascending))
@@ -186,7 +186,7 @@ def _rules(
     weight = _numbers(line, match[3])
     if len(weight) != 1:
         raise line.error("expected one weight in parentheses.")
-    # OR over one condition, or none, is that condition.
+    # With at most one condition, OR equals AND.
     asked = [i for i, term in enumerate(given) if term != ANY]
     if match[4] == "1" or len(asked) < 2:
         return [Rule(given, then, weight[0])]
@@ -200,7 +200,7 @@ def _rules(
 
 def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str, ...]:
     parts = text.split()
-    # The limit of digits keeps int() from very long numbers.
+    # The limit on digits keeps very long numbers from int().
     if not all(re.fullmatch(r"-?\d{1,6}", part) for part in parts):
         raise line.error("terms are whole numbers.")
     numbers = [int(part) for part in parts]
@@ -210,7 +210,7 @@ def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str,
         )
     names = []
     for number, (variable, terms) in zip(numbers, variables, strict=True):
-        # MATLAB's sign for NOT.
+        # MATLAB denotes NOT by a minus sign.
         if number < 0:
             raise line.error("negated terms are not supported; write the opposite set.")
         if number > len(terms):

@@ -12,21 +12,21 @@ from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, parse_ru
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_CELLS = 81  # of a map along each axis
-_SAMPLES_AT_ONCE = 512  # the clipped output sets of this many fit a core's cache
+_CELLS = 81  # cells of a map along each axis
+_SAMPLES_AT_ONCE = 512  # their clipped output sets fit into a core's cache
 
 
 class MamdaniController(nn.Module):
     """Mamdani inference: AND = min, implication = min, aggregation = max, centroid.
 
-    Inputs outside their universe count as at its edge; NaN stays NaN. Where no rule fires at all
-    (sets with gaps), an output is the middle of its universe.
+    Inputs outside their universe are clamped to its edge; NaN stays NaN. If no rule fires (sets
+    with gaps), an output is the middle of its universe.
 
     Args:
         rules: variables, sets and rules.
-        points: of the universe of each output, evenly spaced with both ends.
+        points: number of evenly spaced points of each output universe, including both ends.
         centroid: "trapezoid" (integral by the trapezoid rule) or "sum" (plain sum over the points,
-            as MATLAB does).
+            as in MATLAB).
 
     References:
         Mamdani and Assilian (1975). TLRIP paper, Tables 4 and 5.
@@ -68,7 +68,7 @@ class MamdaniController(nn.Module):
         self.register_buffer("middle", ends.mean(1))
 
     def forward(self, qd_abs: Tensor, qdd: Tensor) -> Tensor:
-        """Outputs for a two-input controller, in SI at the border.
+        """Outputs of a two-input controller, with inputs in SI units.
 
         Args:
             qd_abs: |joint velocity| [rad/s], any shape.
@@ -81,8 +81,8 @@ class MamdaniController(nn.Module):
     def infer(self, x: Tensor) -> Tensor:
         """Outputs (*batch, outputs) of inputs (*batch, inputs) in the rule base's own units."""
         strengths = self._rule_strengths(x)
-        # Each term's set is clipped once, at its strongest rule, with a fifth of the work of
-        # clipping every rule's. Terms without as many rules point to a row of zeros.
+        # Each term's set is clipped once, at the strength of its strongest rule, which is a fifth
+        # of the work of clipping it for every rule. Terms with fewer rules point to a zero row.
         padded = torch.cat([strengths, torch.zeros_like(strengths[:1])])
         strengths = padded[self.rules_of_term].amax(2)
         blocks = strengths.split(_SAMPLES_AT_ONCE, -1)
@@ -90,12 +90,12 @@ class MamdaniController(nn.Module):
         return y.reshape(x.shape[:-1] + self.middle.shape)
 
     def _rule_strengths(self, x: Tensor) -> Tensor:
-        """Strengths (rules, samples): the least membership of a rule's terms, times its weight."""
+        """Strengths (rules, samples): smallest membership of a rule's terms, times its weight."""
         clamped = torch.clamp(x.reshape(-1, self.inputs), self.lower, self.upper)
         strengths = self.weights
         for i, variable in enumerate(self.rule_base.inputs):
             held = [term(clamped[:, i]) for term in variable.sets]
-            # A row of ones for rules that do not ask for this input.
+            # A row of ones for rules that do not use this input.
             asked = torch.stack([*held, torch.ones_like(held[0])])[self.antecedents[i]]
             strengths = asked if i == 0 else torch.minimum(strengths, asked)
         return strengths * self.weights
@@ -105,7 +105,7 @@ class MamdaniController(nn.Module):
         clipped = torch.minimum(strengths.unsqueeze(2), self.output_sets.unsqueeze(3))
         moments = torch.bmm(self.moments, clipped.amax(1))
         area, moment = moments[:, 0], moments[:, 1]
-        # No rule fires: the middle of the universe, and no division by zero in the gradient.
+        # If no rule fires: the middle of the universe, without division by zero in the gradient.
         empty = area == 0
         offset = torch.where(empty, 0.0, moment / torch.where(empty, 1.0, area))
         return offset.T + self.middle
@@ -116,8 +116,8 @@ def paper_controller(
 ) -> MamdaniController:
     """The TLRIP paper's controller of B and C for its joint 2, 3 or 4 (linear friction model).
 
-    The rules were printed for joint 2 and are used for all three; the C terms of NM x VF and ZE x
-    VF (both L) are a best reading of the print.
+    The rules are printed for joint 2 and used for all three; the C terms of NM x VF and ZE x VF
+    (both L) are our best reading of the print.
 
     References:
         TLRIP paper, Table 4 (sets) and Table 5 (rules).
@@ -133,7 +133,7 @@ def _rule_indices(rules: RuleBase) -> tuple[Tensor, Tensor]:
     """Term of each input by rule (inputs, rules), and rules by output term, padded."""
     antecedents = [
         [
-            # "Any" points behind the terms, to a row of ones.
+            # "Any" points past the terms, to a row of ones.
             len(variable.terms) if rule.given[i] == ANY else variable.terms.index(rule.given[i])
             for rule in rules.rules
         ]
@@ -148,7 +148,7 @@ def _rule_indices(rules: RuleBase) -> tuple[Tensor, Tensor]:
     ]
     terms = max(len(output) for output in speaking)
     most = max(len(numbers) for output in speaking for numbers in output)
-    # Padding points behind the rules, to a row of zeros, which no maximum notices.
+    # Padding points past the rules, to a row of zeros, which does not affect a maximum.
     padded = torch.full((len(speaking), terms, most), len(rules.rules))
     for o, output in enumerate(speaking):
         for t, numbers in enumerate(output):
@@ -168,19 +168,19 @@ def _output_sets(
         shapes[o, : len(variable.sets)] = torch.stack([term(universe) for term in variable.sets])
         weights = torch.ones_like(universe)
         if centroid == "trapezoid":
-            # The spacing cancels in the centroid.
+            # The spacing cancels out in the centroid.
             weights[0] = weights[-1] = 0.5
-        # About the middle: no digits are lost where the universe lies far from zero.
+        # About the middle, so that no digits are lost if the universe is far from zero.
         offset = universe - 0.5 * (universe[0] + universe[-1])
         moments[o] = torch.stack([weights, weights * offset])
     return shapes, moments
 
 
 def controller_surface(controller: MamdaniController) -> "Figure":
-    """A controller's outputs over its two inputs in SI, a map an output.
+    """Maps of a controller's outputs over its two inputs in SI, one per output.
 
     Raises:
-        ValueError: if the controller has not two inputs.
+        ValueError: if the controller does not have two inputs.
     """
     from nfriction.plots import style  # matplotlib is slow to import
     from nfriction.plots.neurofuzzy import draw_map
@@ -192,7 +192,7 @@ def controller_surface(controller: MamdaniController) -> "Figure":
     with torch.no_grad():
         values = controller.infer(torch.as_tensor(np.stack(np.meshgrid(*grids), -1))).numpy()
     x, y = (grid * float(si) for grid, si in zip(grids, controller.si_factor, strict=True))
-    # The controller takes degrees to radians; a bare number stays one.
+    # The controller converts degrees to radians; dimensionless inputs are unchanged.
     labels = [
         f"{variable.name} [{variable.unit.replace('deg', 'rad').replace('^2', '²')}]"
         for variable in rules.inputs

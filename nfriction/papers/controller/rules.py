@@ -1,4 +1,4 @@
-"""Rule bases of fuzzy controllers: variables, their sets, rules; and the JSON files they come in.
+"""Rule bases of fuzzy controllers: variables, their sets, rules, and their JSON files.
 
 A file looks like this (see also `nfriction/papers/controller/data/`)::
 
@@ -20,12 +20,12 @@ A file looks like this (see also `nfriction/papers/controller/data/`)::
       }
     }
 
-A set is the range [low, high] that it spans (`membership.sets_from_ranges`), or for full control
-`{"shape": "gaussian", "parameters": [centre, sigma]}` with a shape of `membership.SHAPES`; a
-variable uses one way or the other. Sets are written from the smallest values to the largest. The
-universe may be left out where ranges give it. The table has a row for each set of the other input
-and in it a cell for each set of the input that `columns` names, in their order; a cell gives a
-term for each output, in their order. Instead of `table`, `rules` may list rules one by one, with
+A set is given by the range [low, high] that it spans (`membership.sets_from_ranges`) or, for full
+control, by `{"shape": "gaussian", "parameters": [centre, sigma]}` with a shape of
+`membership.SHAPES`; all sets of a variable use the same form. Sets are listed from the smallest
+values to the largest. The universe may be omitted if ranges define it. The table has one row for
+each set of the other input, with one cell for each set of the input named in `columns`, in order; a
+cell gives one term per output, in order. Instead of `table`, `rules` may list rules one by one for
 any number of inputs: `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
 """
 
@@ -43,7 +43,7 @@ from nfriction.io.files import numbers, parse_json, shortened
 from nfriction.plant.base import check_keys
 
 FORMAT = "nfriction-rules/1"
-# Bounds of foreign files: inference costs rules times points of the output universe.
+# Limits on untrusted files: inference costs rules times points of the output universe.
 MAX_BYTES = 1_000_000
 MAX_SETS, MAX_VARIABLES, MAX_RULES = 64, 16, 10_000
 
@@ -57,7 +57,7 @@ SI_FACTOR = {
     "deg/s^2": math.pi / 180.0,
     "1": 1.0,
 }
-"""Units an input may be written in, and how much one of it is in SI."""
+"""Units in which an input may be written, and their values in SI."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Variable:
         if not 1 <= len(self.sets) <= MAX_SETS:
             raise ValueError(f"{where}: needs 1 to {MAX_SETS} sets, got {len(self.sets)}.")
         _refuse_duplicates(f"{where}: sets", self.terms)
-        # A set of that name could never be asked for.
+        # A rule could never refer to a set of that name.
         if ANY in self.terms:
             raise ValueError(f"{where}: {ANY!r} means any term and cannot name a set.")
         # Ascending sets have a linguistic order, which plots and reports use.
@@ -96,7 +96,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Rule:
-    """If every input is its term, then every output is its term; `*` is any."""
+    """If every input is its term, then every output is its term; `*` means any term."""
 
     given: tuple[str, ...]
     then: tuple[str, ...]
@@ -108,8 +108,8 @@ class RuleBase:
     """Variables and rules of a Mamdani controller, validated.
 
     Args:
-        name: what the controller is for.
-        inputs, outputs: variables in the order in which rules name their terms.
+        name: purpose of the controller.
+        inputs, outputs: variables, in the order in which rules name their terms.
         rules: in any order.
     """
 
@@ -119,7 +119,7 @@ class RuleBase:
     rules: tuple[Rule, ...]
 
     def __post_init__(self) -> None:
-        # Here and not in the readers: rules built in Python are checked as those of files are.
+        # Checked here and not in the readers, to include rules built in Python.
         for kind, variables in (("inputs", self.inputs), ("outputs", self.outputs)):
             if not 1 <= len(variables) <= MAX_VARIABLES:
                 raise ValueError(f"{kind}: 1 to {MAX_VARIABLES} variables, got {len(variables)}.")
@@ -135,7 +135,7 @@ class RuleBase:
         for number, rule in enumerate(self.rules, 1):
             _check_terms(f"rule {number}: if", rule.given, self.inputs)
             _check_terms(f"rule {number}: then", rule.then, self.outputs)
-            # A weight of zero is a rule that never fires; above 1, a strength is no membership.
+            # With weight zero a rule never fires; above 1, its strength is not a membership.
             if not 0.0 < rule.weight <= 1.0:
                 raise ValueError(f"rule {number}: weight must be in (0, 1], got {rule.weight}.")
 
@@ -144,7 +144,7 @@ def load_rules(path: str | Path) -> RuleBase:
     """Rule base from a JSON file in the schema of this module.
 
     Raises:
-        ValueError: no such rule base; the message names the place and the remedy.
+        ValueError: if it is not a rule base; the message names the place and the remedy.
     """
     path = Path(path)
     return parse_rules(read_text(path), path.name)
@@ -154,7 +154,7 @@ def read_text(path: Path) -> str:
     """Text of a rule file.
 
     Raises:
-        ValueError: too large, or not UTF-8; names the file.
+        ValueError: if the file is too large or not UTF-8; the message names the file.
     """
     # Before it is read into memory.
     if path.stat().st_size > MAX_BYTES:
@@ -170,7 +170,7 @@ def parse_rules(text: str, source: str = "rules") -> RuleBase:
     try:
         document = parse_json(text, _unique)
         return _rule_base(document)
-    # Python's parser recurses into brackets, of which a hostile file may open thousands.
+    # Python's parser recurses into brackets, and a malicious file may open thousands of them.
     except RecursionError:
         raise ValueError(f"{source}: nested too deeply for a rule base.") from None
     except ValueError as error:
@@ -212,12 +212,12 @@ def _variable(name: str, entry: Any) -> Variable:
             members = sets_from_ranges(list(sets), ranges)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
-        # The shoulders are full at these ends, so nothing is to be gained beyond.
+        # The shoulders reach 1 at these ends, so nothing changes beyond them.
         universe = [ranges[0][0], ranges[-1][1]] if universe is None else universe
     elif all(isinstance(value, dict) for value in sets.values()):
         members = tuple(_set(f"{where}: set {term!r}", term, v) for term, v in sets.items())
         if universe is None:
-            # Gaussians have no ends to take it from.
+            # Gaussians have no ends from which to derive it.
             raise ValueError(f'{where}: sets given by shape need a "universe": [low, high].')
     else:
         raise ValueError(f"{where}: give every set as a range or every set by its shape.")
@@ -304,7 +304,7 @@ def _pair(value: Any, where: str) -> tuple[float, float]:
 
 
 def _number(value: Any, where: str) -> float:
-    # `numbers` would read those of a list, too.
+    # `numbers` would also accept a list.
     if isinstance(value, list):
         raise ValueError(f"{where}: expected a number, got {reprlib.repr(value)}.")
     return float(numbers(where, value))
@@ -321,7 +321,7 @@ def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, 
             raise ValueError(
                 f"{where}: unknown term {term!r} of {variable.name!r}; it has {variable.terms}."
             )
-    # Such a rule would always fire, or do nothing.
+    # Such a rule would always fire, or have no effect.
     if all(term == ANY for term in terms):
         raise ValueError(f"{where}: at least one variable must have a term.")
 

@@ -1,4 +1,4 @@
-"""Samples of fuzzy controllers along a measured motion, on which the papers train their network."""
+"""Samples of fuzzy controllers along a measured motion, as used to train the papers' network."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from nfriction.signals import Motion, causal_motion
 
 INPUTS = ("speed", "acceleration")
 DIGITS = 9
-"""Of the numbers in the files: the last bits of a float differ between machines."""
+"""Digits of the numbers in the files, as the last bits of a float differ between machines."""
 CHECKSUMS = "checksums.json"
 
 
@@ -33,7 +33,7 @@ class ControllerSamples:
 
     Attributes:
         joint_names: in the order of the arrays.
-        output_names: of the coefficients.
+        output_names: names of the coefficients.
         time: [s], shape (sample,).
         x: |velocity| [rad/s] and acceleration [rad/s^2], shape (sample, joint, 2).
         y: coefficients in SI, shape (sample, joint, output).
@@ -66,13 +66,13 @@ def sampled(
     """Outputs of a controller for each joint along a motion.
 
     Args:
-        controllers: of |velocity| and acceleration, one for each joint.
-        motion: velocity and acceleration as a controller has them, (sample, joint).
-        joint_names: one for each joint.
-        every: take one sample of this many.
+        controllers: of |velocity| and acceleration, one per joint.
+        motion: velocity and acceleration as available to a controller, (sample, joint).
+        joint_names: one per joint.
+        every: use one of this many samples.
 
     Raises:
-        ValueError: if there is not one controller with the same outputs for each joint.
+        ValueError: if there is not one controller per joint, all with the same outputs.
     """
     qd, qdd = torch.as_tensor(motion.qd[::every]), torch.as_tensor(motion.qdd[::every])
     names = {tuple(v.name for v in c.rule_base.outputs) for c in controllers}
@@ -90,11 +90,11 @@ def sampled(
 def make_samples(*, seed: int = 0, duration: float | None = None) -> ControllerSamples:
     """The papers' controllers along the measured friction experiment of the TLRIP twin.
 
-    40 s at 1 kHz make 40,000 samples a joint. Velocity and acceleration come from the encoders by
-    the causal filters of a real-time controller.
+    40 s at 1 kHz give 40,000 samples per joint. Velocity and acceleration are computed from the
+    encoders by the causal filters of a real-time controller.
 
     Args:
-        seed: of the encoders' errors.
+        seed: for the encoders' errors.
         duration: of the experiment [s]; by default 40.
 
     References:
@@ -114,7 +114,7 @@ def build_samples(
     """Write `<joint>.csv.gz` for every joint and `checksums.json`; see `make_samples`.
 
     Returns:
-        The samples as they are in the files, with nine digits.
+        The samples as stored in the files, with nine digits.
     """
     folder, made = Path(out), make_samples(seed=seed, duration=duration)
     folder.mkdir(parents=True, exist_ok=True)
@@ -122,7 +122,7 @@ def build_samples(
     for joint, name in enumerate(made.joint_names):
         table = made.to_pandas(joint).map(lambda value: float(f"{value:.{DIGITS}g}"))
         write_table(table, folder / f"{name}.csv.gz")
-    # Last: a folder without it is not complete.
+    # Written last: a folder without it is incomplete.
     found = read_samples(folder, made.joint_names)
     write_atomically(folder / CHECKSUMS, json.dumps(checksums(found), indent=1).encode())
     return found
@@ -131,7 +131,7 @@ def build_samples(
 def read_samples(
     folder: str | os.PathLike[str], joint_names: Sequence[str] = ("joint2", "joint3", "joint4")
 ) -> ControllerSamples:
-    """Samples from the folder that `build_samples` wrote them to.
+    """Samples from the folder to which `build_samples` wrote them.
 
     Raises:
         OSError: if a file is missing.
@@ -153,7 +153,7 @@ def read_samples(
 
 
 def checksums(samples: ControllerSamples) -> dict[str, str]:
-    """SHA-256 by joint of its numbers, rounded as in the files."""
+    """SHA-256 of the numbers of each joint, rounded as in the files."""
     found = {}
     for joint, name in enumerate(samples.joint_names):
         rows = samples.to_pandas(joint).to_numpy()

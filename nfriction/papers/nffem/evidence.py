@@ -1,11 +1,11 @@
-"""Bayesian regularisation: least squares with one prior precision for each group of parameters.
+"""Bayesian regularisation: least squares with one prior precision per group of parameters.
 
 Gauss-Newton steps on the parameters w alternate with MacKay's updates of the precisions.
 
 Convention (Foresee and Hagan): E_D = sum e^2 and E_g = sum (w - w0)^2 over group g, without
-halves. Minus the log posterior is beta E_D + sum_g alpha_g E_g, so the noise has the variance
-1 / (2 beta), a parameter of group g the prior variance 1 / (2 alpha_g), the posterior the
-covariance S^-1 / 2 with S = beta J^T J + diag(alpha), and at the maximum of the evidence
+factors of 1/2. The negative log posterior is beta E_D + sum_g alpha_g E_g, so the noise variance is
+1 / (2 beta), the prior variance of a parameter of group g is 1 / (2 alpha_g), the posterior
+covariance is S^-1 / 2 with S = beta J^T J + diag(alpha), and at the maximum of the evidence
 
     alpha_g = gamma_g / (2 E_g),    beta = (n - gamma) / (2 E_D).
 
@@ -47,22 +47,22 @@ MESSAGES: dict[str, str] = {
     "not_finite": "The errors or their Jacobian are not finite, at the start or at every step.",
     "stopped": "Stopped by the callback or by an interrupt; the parameters are the best reached.",
 }
-# Of the first step, as in Foresee and Hagan; beyond the largest a step is too short to matter.
+# Damping of the first step as in Foresee and Hagan; above the largest, steps are negligible.
 FIRST_DAMPING, LARGEST_DAMPING = 0.005, 1e10
-# A group whose prior outweighs its data by this factor is switched off; alpha stops there.
+# A group whose prior outweighs its data by this factor is inactive; alpha is limited to it.
 LARGEST_RATIO = 1e12
 
 
 @dataclass(frozen=True, eq=False)
 class EvidenceState:
-    """State of a run, as given to a callback.
+    """State of a run, as passed to a callback.
 
     Args:
         w: parameters, shape (p,).
         alpha: prior precisions, shape (groups,).
         beta: noise precision.
         damping: mu of the next step.
-        step: accepted steps so far.
+        step: number of accepted steps so far.
     """
 
     w: Tensor
@@ -80,14 +80,14 @@ class EvidenceOptions:
     """Settings of a run.
 
     Args:
-        max_steps: limit of accepted steps.
-        tolerance: of convergence: relative error of alpha = gamma / 2E_g and beta =
+        max_steps: limit on accepted steps.
+        tolerance: for convergence: relative error of alpha = gamma / 2E_g and of beta =
             (n - gamma) / 2E_D, and gain of a full Gauss-Newton step in nats.
         noise_floor: standard deviation of the errors at which fitting ends.
-        callback: called after each accepted step with the state; True stops.
+        callback: called with the state after each accepted step; stops the run by returning True.
         progress: show a bar.
     Raises:
-        ValueError: a tolerance that is not positive.
+        ValueError: if the tolerance is not positive.
     """
 
     max_steps: int = 300
@@ -103,17 +103,17 @@ class EvidenceOptions:
 
 @dataclass(frozen=True, eq=False)
 class EvidenceResult:
-    """Outcome of a fit by evidence; read `converged` before believing it.
+    """Outcome of a fit by evidence; check `converged` before using it.
 
     Args:
-        status: reason for the end; `message` gives it in words.
+        status: reason for termination; `message` describes it in words.
         w: parameters in one vector, shape (p,).
-        alpha, gamma: prior precision and effective parameters, by group.
-        beta: noise precision; the noise has the variance 1 / (2 beta), in the targets' unit.
+        alpha, gamma: prior precision and effective number of parameters, by group.
+        beta: noise precision; the noise variance is 1 / (2 beta), in the targets' unit squared.
         error_squares: E_D.
         parameter_squares: E_g = sum (w - w0)^2, by group.
-        samples: n, number of errors that E_D sums.
-        log_evidence: in nats with all constants: models of the same data can be compared by it.
+        samples: n, number of errors in E_D.
+        log_evidence: in nats, with all constants, so models of the same data can be compared.
         covariance: posterior covariance of the parameters, shape (p, p).
         steps: accepted steps.
         history: log evidence before each step.
@@ -156,23 +156,23 @@ def bayesian_regularisation(
 
     Every trainable parameter is shrunk toward its prior value with the strength that the evidence
     assigns to its group. A step solves (S + mu diag S) d = -(beta J^T e + alpha (w - w0)) and is
-    taken if beta E_D + sum alpha_g E_g falls; else, or where errors are not finite, mu*10. Then
-    come new alpha and beta, and mu/10 if the first trial fell about as predicted. The damping is
-    relative to the diagonal, so that the units of the parameters do not matter; the first step has
-    hardly any prior, as in Foresee and Hagan. The weights are written when the fit ends, also if an
-    interrupt or the callback ends it; a fit that fails from the start leaves the module unchanged.
+    accepted if beta E_D + sum alpha_g E_g falls; otherwise, or if errors are not finite, mu is
+    raised by 10. Then alpha and beta are updated, and mu is divided by 10 if the first trial
+    decreased about as predicted. Damping is relative to the diagonal, so that parameter units do
+    not matter; the first step has hardly any prior, as in Foresee and Hagan. The weights are
+    written when the fit ends, even by an interrupt; a failure at the start changes nothing.
 
     Args:
-        model: outputs of sample i depend on sample i only.
+        model: module whose outputs for sample i depend only on sample i.
         x: inputs, shape (n, ...).
         y: targets, shape of the model's output.
-        kind: group of a parameter by its name; by default each is a group of its own.
+        kind: maps the name of a parameter to its group; by default each is its own group.
         prior: values w0 by parameter name, 0 where missing.
         options: settings; the noise floor is in the unit of `y`.
     Returns:
         Weights, alpha, beta, gamma, log evidence, covariance and status.
     Raises:
-        ValueError: samples or prior do not fit the model.
+        ValueError: if samples or prior do not match the model.
     """
     options = EvidenceOptions() if options is None else options
     parameters, given = trainable(model), prior or {}
@@ -187,9 +187,9 @@ def bayesian_regularisation(
     places = torch.tensor([names.index(group) for group in groups], device=x.device)
     sizes = torch.tensor([value.numel() for value in parameters.values()], device=x.device)
     centres = {n: torch.zeros_like(value) + given.get(n, 0.0) for n, value in parameters.items()}
-    # Errors within the rounding of the targets carry no information.
+    # Errors within the round-off of the targets contain no information.
     rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
-    # Samples last in memory, as layers take them: kernels are vectorised over samples.
+    # Samples last in memory, as in the layers, whose kernels are vectorised over samples.
     x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
     options = replace(options, noise_floor=max(options.noise_floor, rounding))
     prior_groups = PriorGroups(flatten(centres), places.repeat_interleave(sizes), names)
@@ -225,7 +225,7 @@ class _Fit:
         w = flatten(trainable(model))
         # Exact fits would otherwise drive beta to infinity.
         self.noise_floor = max(options.noise_floor, 1e-15)
-        # An interrupt of the first evaluation must still find something to report.
+        # An interrupt during the first evaluation must still have something to report.
         nan = torch.full_like(w, math.nan)
         self.state = EvidenceState(w, nan.new_full((len(prior.names),), math.nan))
         self.local = NormalEquations(nan.diag(), nan, nan.sum())
@@ -248,12 +248,12 @@ class _Fit:
                 if self._settled(known):
                     return "converged"
                 unexplained = self.samples - float(known.gamma.sum())
-                # Below the known noise the fit only learns that noise.
+                # Below the known noise level, the fit would learn only noise.
                 if float(self.local.squares) <= unexplained * self.noise_floor**2:
                     return "noise_floor"
                 if self.state.step >= options.max_steps:
                     return "max_steps"
-                # At the start the residuals say nothing yet about noise and priors.
+                # At the start, residuals do not yet indicate noise and priors.
                 if self.state.step > 0:
                     alpha, beta = reestimate(
                         known, self.local, self.prior.of, self.samples, self.state.alpha,
@@ -273,20 +273,20 @@ class _Fit:
         return posterior(self.local, offset, self.prior.of, self.samples, state.alpha, state.beta)
 
     def _start(self) -> None:
-        """Noise as large as the errors and a prior far below the data."""
+        """Initial state: noise as large as the errors, and a prior far weaker than the data."""
         local, groups, count = self.local, self.prior.of, len(self.prior.names)
         beta = self.samples / max(2 * float(local.squares), 1e-300)
         beta = min(beta, 0.5 / self.noise_floor**2)
         sizes = group_sums(torch.ones_like(local.Jte), groups, count)
         curvature = group_sums(local.JtJ.diagonal(), groups, count) / sizes
-        # A group without influence at the start has no curvature to compare with.
+        # A group without influence at the start has no curvature as reference.
         curvature = torch.where(curvature > 0, curvature, local.JtJ.diagonal().mean())
-        # Far below the data: the first step is nearly plain least squares.
+        # Far weaker than the data: the first step is nearly plain least squares.
         alpha = 1e-6 * beta * torch.where(curvature > 0, curvature, 1.0)
         self.state = replace(self.state, alpha=alpha, beta=beta)
 
     def _settled(self, known: Posterior) -> bool:
-        """True where the log evidence is stationary in w, log alpha and log beta."""
+        """True if the log evidence is stationary in w, log alpha and log beta."""
         alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
         # Derivatives of the log evidence by log alpha are (gamma - 2 alpha E_g) / 2.
         off = (gamma - 2 * alpha * known.parameter_squares).abs() / gamma.clamp(min=1)
@@ -299,7 +299,7 @@ class _Fit:
         )
 
     def _advance(self) -> Status | None:
-        """Take one step that lowers the objective, with as much damping as that needs."""
+        """Take one step that lowers the objective, with as much damping as needed."""
         state, local = self.state, self.local
         precision = state.alpha[self.prior.of]
         offset = state.w - self.prior.centre
@@ -312,7 +312,7 @@ class _Fit:
             scale, factor = factorise(system + damping * system.diagonal().diag())
             step = -scale * torch.cholesky_solve((scale * slope)[:, None], factor)[:, 0]
             predicted = -float(2 * slope @ step + step @ (system @ step))
-            # Only a nearly undamped step proves that nothing is left to gain.
+            # Only a nearly undamped step proves that no further decrease is possible.
             if damping <= 1 and predicted <= rounding:
                 # The parameters are optimal for these alpha and beta: only those change.
                 self.state = replace(state, step=state.step + 1)
@@ -320,7 +320,7 @@ class _Fit:
             found = self._attempt(state.w + step, precision, objective)
             if found is not None:
                 there, fall = found
-                # After a rejected trial, or a poor model, less damping would cost another trial.
+                # After a rejected trial or a poor model, less damping would cost another trial.
                 if fall > 0.75 * predicted and damping <= state.damping:
                     damping = max(damping / 10, 1e-15)
                 elif fall < 0.25 * predicted:
@@ -334,7 +334,7 @@ class _Fit:
     def _attempt(
         self, w: Tensor, precision: Tensor, objective: float
     ) -> tuple[NormalEquations, float] | None:
-        """Normal equations at `w` and the objective's fall, if all is finite and there is one."""
+        """Normal equations at `w` and the objective's decrease, if finite and positive."""
         beta = self.state.beta
         shrinkage = float(precision @ (w - self.prior.centre).square())
         assign(self.model, w)
@@ -345,7 +345,7 @@ class _Fit:
             return None
         there = normal_equations(self.model, *self.data)
         self.not_finite = not there.finite
-        # The sum that the next objective starts from decides, not its cheap twin.
+        # Decided by the sum on which the next objective is based, not by its cheap equivalent.
         fall = objective - float(beta * there.squares) - shrinkage
         return (there, fall) if fall > 0 and not self.not_finite else None
 
@@ -382,7 +382,7 @@ class Posterior(NamedTuple):
         covariance: of the parameters, (2 S)^-1, shape (p, p).
         gamma: effective (well determined) parameters of each group, shape (groups,).
         log_evidence: log p(data | alpha, beta) in nats, with all its constants.
-        newton_decrement: gain of a full Gauss-Newton step in log posterior, in nats.
+        newton_decrement: gain in log posterior of a full Gauss-Newton step, in nats.
         parameter_squares: E_g, shape (groups,).
     """
 
@@ -401,24 +401,24 @@ def posterior(
     alpha: Tensor,
     beta: float,
 ) -> Posterior:
-    """Posterior, effective parameters and log evidence; exact where the model is linear.
+    """Posterior, effective parameters and log evidence; exact if the model is linear.
 
     Args:
         local: J^T J, J^T e and E_D at the parameters w.
         offset: w - w0, shape (p,).
         groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
-        samples: number n of errors that E_D sums.
+        samples: number n of errors in E_D.
         alpha: prior precision (halved) of each group, shape (groups,), positive.
         beta: noise precision (halved), positive.
     """
     count, precision = len(alpha), alpha[groups]
-    # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
+    # Scaled to a unit diagonal, so that the units of the parameters do not affect accuracy.
     scale, factor = factorise(beta * local.JtJ + precision.diag())
     inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
     slope = beta * local.Jte + precision * offset
     squares = group_sums(offset.square(), groups, count)
-    # The diagonal of S^-1 (beta J^T J) equals 1 - alpha (S^-1)_ii, but keeps its digits where the
-    # prior dominates and the difference would be rounding.
+    # The diagonal of S^-1 (beta J^T J) equals 1 - alpha (S^-1)_ii, but remains accurate where the
+    # prior dominates and the difference would be round-off.
     determined = beta * (inverse * local.JtJ).sum(1)
     sizes = group_sums(torch.ones_like(offset), groups, count)
     log_determinant = 2 * factor.diagonal().log().sum() - 2 * scale.log().sum()
@@ -448,12 +448,12 @@ def reestimate(
 ) -> tuple[Tensor, float]:
     """MacKay's fixed-point update: alpha_g = gamma_g / (2 E_g), beta = (n - gamma) / (2 E_D).
 
-    A group that has not left its prior's centre keeps its alpha: it has no information yet.
+    A group still at the centre of its prior keeps its alpha: it has no information yet.
 
     Args:
-        known: `posterior` at the present alpha and beta.
+        known: `posterior` at the current alpha and beta.
         local, groups, samples, alpha: those of this posterior.
-        largest_beta: limit by a known noise floor.
+        largest_beta: limit from a known noise floor.
     Returns:
         The new alpha, shape (groups,), and beta.
     """
@@ -462,9 +462,9 @@ def reestimate(
     beta = float((samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
     beta = min(beta, largest_beta)
     limit = LARGEST_RATIO * beta * curvature
-    # A group without curvature has no scale for a limit.
+    # A group without curvature has no reference for a limit.
     limit = torch.where(limit > 0, limit, alpha)
     estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
-    # At the centre of its prior the estimate divides zero by zero.
+    # At the centre of its prior, the estimate of a group would divide zero by zero.
     usable = (known.parameter_squares > 0) & (estimate > 0)
     return torch.where(usable, estimate, alpha), beta

@@ -25,9 +25,9 @@ from nfriction.fuzzy import RBFNetwork
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.signals import Motion
 
-# Coefficients of a radial basis network may grow to so many of their scales.
+# Upper limit on coefficients of a radial basis network, in units of their scales.
 LARGEST = 4.0
-# Its units are placed by one sample of this many.
+# Its units are placed using one of this many samples.
 THINNED = 10
 
 
@@ -35,8 +35,8 @@ def fit_rbf(task: FitTask) -> FitResult:
     """Fit the output layer of the papers' network from the constant fit of its law.
 
     The units are placed along the smoothed motion; the output layer starts at the constant law and
-    is pulled toward it. It is kept if it errs less on windows held out, as any network; the plant
-    stays as the constant fit found it.
+    is pulled toward it. Like any network, it is kept if its error on hold-out windows is smaller;
+    the plant stays as the constant fit found it.
     """
     require_motion(task.plant, task.recordings)
     model, options = task.model.requires_grad_(False), task.options
@@ -84,12 +84,12 @@ def fit_rbf(task: FitTask) -> FitResult:
 def place_units(
     schedule: RBFCoefficients, values: Tensor, scale: Tensor, motions: Sequence[Motion]
 ) -> None:
-    """Set a network to constant coefficients, its units by k-means along motions.
+    """Set a network to constant coefficients, with its units placed by k-means along motions.
 
     Args:
         schedule: changed in place.
         values: coefficients, (joint, coefficient).
-        scale: size of each, (joint, coefficient), by which its universe is chosen.
+        scale: size of each, (joint, coefficient), which determines its universe.
         motions: in joint coordinates.
     """
     qd, qdd, state = [], [], []
@@ -98,7 +98,7 @@ def place_units(
         qdd.append(torch.as_tensor(motion.qdd))
         state.append(schedule.states(qd[-1], qdd[-1]))
     moved = torch.cat(qd), torch.cat(qdd), torch.cat(state)
-    # Without a universe yet, which would clamp the motion.
+    # No universe yet, since it would clamp the motion.
     schedule.input_lower.fill_(-torch.inf)
     schedule.input_upper.copy_(moved[0].abs().amax(0)[:, None].expand_as(schedule.input_upper))
     schedule.input_upper[:, 1:] = torch.inf
@@ -107,7 +107,7 @@ def place_units(
     network = RBFNetwork(joints, inputs, schedule.head_units, values.shape[1])
     network.init_kmeans(x[::THINNED])
     network.output_weight.zero_()
-    # From its bound a coefficient could not rise.
+    # Starting at its bound, a coefficient could not rise.
     start = torch.where(schedule.positive, torch.maximum(values, LEAST_RATIO * scale), values)
     network.output_bias.copy_(start)
     lower = torch.where(schedule.positive, torch.zeros_like(scale), -LARGEST * scale)

@@ -1,12 +1,12 @@
 """Normal equations of a model's least-squares problem, in chunks of bounded memory.
 
-A model is a module, differentiated by the parameters that require a gradient at their present
-values; sample i of the output must depend on sample i of the input only.
+A model is a module, differentiated by the parameters that require a gradient at their current
+values; sample i of the output must depend only on sample i of the input.
 
-Models are differentiated automatically, sample by sample. The outputs of a network with a common
-hidden layer have derivatives that combine fewer columns than there are parameters, so one product
-of matrices can cover all outputs; this is five times faster (52 parameters, 40,000 samples: 10 ms
-instead of 60). A `LinearOutputModule` offers these columns.
+Models are differentiated by autograd, sample by sample. If the outputs of a network share a hidden
+layer, their derivatives combine fewer columns than there are parameters, so one matrix product can
+cover all outputs; this is about five times faster (52 parameters, 40,000 samples: 10 ms instead of
+60). A `LinearOutputModule` provides these columns.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from torch.func import functional_call, vjp, vmap
 
 from nfriction.fuzzy.grouped import LinearOutputModule
 
-# 4 MiB of Jacobian or columns at a time: below, the calls cost more than the arithmetic; above, the
-# numbers fall out of the cache and into memory that the system hands out anew for every call.
+# 4 MiB of Jacobian or columns at a time: with less, calls cost more than arithmetic; with more, the
+# numbers no longer fit into the cache, and the system allocates new memory for every call.
 CHUNK_ENTRIES = 2**19
-# Samples at a time where only outputs are computed, whose intermediates then stay in the cache.
+# Samples at a time if only outputs are computed, so that intermediate results stay in the cache.
 CHUNK_SAMPLES = 2**14
 
 
@@ -54,7 +54,7 @@ def unflatten(vector: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Inverse of `flatten`: views of `vector` with the names and shapes of `like`.
 
     Raises:
-        ValueError: the number of entries differs.
+        ValueError: if the number of entries differs.
     """
     sizes = [value.numel() for value in like.values()]
     if vector.shape != (sum(sizes),):
@@ -70,7 +70,7 @@ def unflatten(vector: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def assign(module: nn.Module, vector: Tensor) -> None:
-    """Set the parameters that require a gradient to those of a vector, in place."""
+    """Set the parameters that require a gradient to the values of a vector, in place."""
     own = trainable(module)
     for name, value in unflatten(vector, own).items():
         own[name].copy_(value)
@@ -79,7 +79,7 @@ def assign(module: nn.Module, vector: Tensor) -> None:
 def jacobian_pieces(
     model: nn.Module, inputs: Tensor
 ) -> Iterator[tuple[slice, Tensor, tuple[Tensor, ...]]]:
-    """Differentiate a model by its parameters, one chunk of samples after the other.
+    """Differentiate a model by its parameters, one chunk of samples after another.
 
     Args:
         model: any module.
@@ -118,7 +118,7 @@ def normal_equations(model: nn.Module, inputs: Tensor, targets: Tensor) -> Norma
         inputs: shape (n, ...).
         targets: shape (n, *outputs).
     Raises:
-        ValueError: targets do not fit.
+        ValueError: if targets do not match.
     """
     check_samples(inputs, targets)
     if isinstance(model, LinearOutputModule):
@@ -127,7 +127,7 @@ def normal_equations(model: nn.Module, inputs: Tensor, targets: Tensor) -> Norma
     JtJ, Jte, squares = inputs.new_zeros(p, p), inputs.new_zeros(p), inputs.new_zeros(())
     for rows, output, jacobians in jacobian_pieces(model, inputs):
         error = _errors(output, targets[rows])
-        # Output by output the matrix product takes any memory layout without a copy.
+        # Output by output, the matrix product accepts any memory layout without a copy.
         for k, J in enumerate(jacobians):
             JtJ.addmm_(J.T, J)
             Jte.addmv_(J.T, error[:, k])
@@ -137,14 +137,14 @@ def normal_equations(model: nn.Module, inputs: Tensor, targets: Tensor) -> Norma
 
 @torch.no_grad()
 def sum_of_squares(model: nn.Module, inputs: Tensor, targets: Tensor) -> Tensor:
-    """Sum of squared errors alone: the cheap trial of a step."""
+    """Sum of squared errors only, as a cheap trial of a step."""
     parts = zip(inputs.split(CHUNK_SAMPLES), targets.split(CHUNK_SAMPLES), strict=True)
     squares = (_errors(model(x), y).square().sum() for x, y in parts)
     return sum(squares, inputs.new_zeros(()))
 
 
 def check_samples(inputs: Tensor, targets: Tensor) -> None:
-    """Raise ValueError where samples and targets do not belong together."""
+    """Raise ValueError if samples and targets do not match."""
     # Slicing would silently shorten the longer of the two.
     if len(inputs) == 0 or len(inputs) != len(targets):
         raise ValueError(
@@ -165,14 +165,14 @@ def _errors(output: Tensor, targets: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _from_columns(layer: LinearOutputModule, inputs: Tensor, targets: Tensor) -> NormalEquations:
-    """Normal equations by products of all columns and errors, group by group."""
+    """Normal equations from products of all columns and errors, group by group."""
     _errors(layer(inputs[:1]), targets[:1])
     readout, parameters = layer.readout(), trainable(layer)
     maps = torch.cat(list(layer.jacobian_maps().values()), -1)
     groups, outputs, used = readout.shape
     columns = maps.shape[2]
     chunk = min(len(inputs), max(1, CHUNK_ENTRIES // (groups * (columns + outputs))))
-    # Reused: the first touch of fresh memory costs more than the arithmetic.
+    # Reused, because first access to new memory costs more than the arithmetic.
     buffer = inputs.new_empty(groups, columns + outputs, chunk)
     grams = inputs.new_zeros(groups, columns + outputs, columns + outputs)
     for x, y in zip(inputs.split(chunk), targets.split(chunk), strict=True):
@@ -185,7 +185,7 @@ def _from_columns(layer: LinearOutputModule, inputs: Tensor, targets: Tensor) ->
     numbers = unflatten(torch.arange(count, device=inputs.device), parameters).values()
     places = torch.cat([number.reshape(groups, -1) for number in numbers], 1)
     JtJ, Jte = inputs.new_zeros(count, count), inputs.new_zeros(count)
-    # Groups share no parameter: J^T J is block diagonal.
+    # Groups share no parameters, so J^T J is block diagonal.
     for where, map_, gram in zip(places, maps, grams, strict=True):
         # From columns to parameters once per group, after the sum over all samples.
         JtJ[where[:, None], where] = (map_.mT @ gram[:columns, :columns] @ map_).sum(0)

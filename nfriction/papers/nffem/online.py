@@ -1,13 +1,13 @@
-"""Online learning: the papers' network follows a friction that changes while the rig runs.
+"""Online learning: the papers' network follows friction that changes while the rig runs.
 
-Its output layer is learnt by recursive least squares of the measured friction torque. With the
-units' outputs phi, the law's slope g_k by the coefficient k and weights in units of the
-coefficient's scale s_k, a joint's torque is f . w with f_ku = g_k s_k phi_u, and a sample moves
+Its output layer is learnt by recursive least squares from the measured friction torque. With the
+units' outputs phi, the law's derivative g_k by coefficient k and weights in units of the
+coefficient's scale s_k, a joint's torque is f . w with f_ku = g_k s_k phi_u, and a sample updates
 
     w += P f e / (l r^2 + f'P f),    P = (P - P f f'P / (l r^2 + f'P f)) / l
 
-by the error e of the torque, with its standard deviation r and forgetting l. Everything is bounded:
-the coefficients by a margin around the trained ones, the covariance P by its first trace.
+given the torque error e, its standard deviation r and the forgetting factor l. The coefficients are
+bounded by a margin around the trained ones, and the covariance P by its initial trace.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class OnlineOptions:
     """Settings of online learning.
 
     Attributes:
-        noise: standard deviation of the measured friction torque [N m], inflated where errors of
-            neighbouring samples are alike.
+        noise: standard deviation of the measured friction torque [N m], inflated if errors of
+            neighbouring samples are correlated.
         forgetting: time in which the weight of a sample falls to 1/e [s].
-        sample_time: from one learnt sample to the next [s].
-        spread: standard deviation of the weights at the start, relative to the coefficients.
-        margin: factor by which the coefficients may leave the range that was trained.
+        sample_time: time between learnt samples [s].
+        spread: initial standard deviation of the weights, relative to the coefficients.
+        margin: factor by which the coefficients may leave their trained range.
         slowest: speed below which nothing is learnt [rad/s]: at rest friction balances any torque.
 
     Raises:
@@ -63,7 +63,7 @@ class OnlineOptions:
 
     @property
     def forget(self) -> float:
-        """Weight of the past after one sample."""
+        """Forgetting factor per sample."""
         return math.exp(-self.sample_time / self.forgetting)
 
 
@@ -71,8 +71,8 @@ class OnlineNetwork:
     """A model with the papers' network whose output layer learns, sample by sample.
 
     Args:
-        model: with coefficients of `network="rbf"`, which stays as it is.
-        options: of the learning.
+        model: with coefficients of `network="rbf"`; it is not changed.
+        options: settings of the learning.
 
     Attributes:
         weight: output layer and bias in units of `scale`, (joint, coefficient, unit + 1).
@@ -96,7 +96,7 @@ class OnlineNetwork:
                 f"got {type(schedule).__name__}."
             )
         self.model, self.schedule, self.options = model, schedule, options
-        # What was trained is what the network gives where its units lie, along the motion.
+        # The trained range is that of the outputs at the units' centres, along the motion.
         found = schedule.network(schedule.network.centres.detach().transpose(0, 1)).detach()
         held = torch.minimum(torch.maximum(found, schedule.output_lower), schedule.output_upper)
         lower, upper = held.amin(0), held.amax(0)
@@ -112,13 +112,13 @@ class OnlineNetwork:
 
     @torch.no_grad()
     def __call__(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
-        """Friction torque and coefficients at motions (*batch, joint), by the present weights."""
+        """Friction torque and coefficients at motions (*batch, joint), with the current weights."""
         coefficients = self._coefficients(self._regressors(qd, qdd))
         return self.model.torque(qd, load, coefficients), coefficients
 
     @torch.no_grad()
     def learn(self, qd: Tensor, qdd: Tensor, load: Tensor, measured: Tensor) -> None:
-        """Move the weights by one sample of the measured friction torque, each (joint,)."""
+        """Update the weights with one sample of the measured friction torque, each (joint,)."""
         options = self.options
         known = qd.abs() + qdd.abs() + load.abs() + measured.abs() < math.inf
         known = known & (qd.abs() >= options.slowest)
@@ -133,7 +133,7 @@ class OnlineNetwork:
         move = (pf / spread * (measured - torque).unsqueeze(-1)).view_as(self.weight)
         left = self.covariance - pf.unsqueeze(-1) * (pf / spread).unsqueeze(-2)
         trace = left.diagonal(dim1=-2, dim2=-1).sum(-1) / options.forget
-        # Without it, directions that the motion leaves alone would grow without bound.
+        # Without this, the covariance would grow without bound in directions that are not excited.
         shrink = (f.shape[-1] * options.spread**2 / trace).clamp_max(1.0) / options.forget
         known = known[:, None, None]
         self.weight = torch.where(known, self.weight + move, self.weight)
@@ -153,7 +153,7 @@ class OnlineNetwork:
 def law_slopes(
     model: FrictionModel, qd: Tensor, load: Tensor, coefficients: Tensor, learnt: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Torque of a law, and its slopes by the coefficients that it is linear in, others zero."""
+    """Torque of a law, and its derivatives by the linear coefficients (zero for others)."""
     torque = model.torque(qd, load, coefficients)
     step = torch.eye(len(learnt), dtype=coefficients.dtype)
     moved = [model.torque(qd, load, coefficients + step[k]) - torque for k in range(len(learnt))]
@@ -163,18 +163,18 @@ def law_slopes(
 def write_online(
     model: FrictionModel, folder: str | Path, options: OnlineOptions, *, name: str = "online"
 ) -> list[Path]:
-    """Write a model that learns while it runs as C for controllers, `<name>.c` and `<name>.h`.
+    """Write a model that learns online as C code for controllers, `<name>.c` and `<name>.h`.
 
-    C89 in double precision that allocates nothing: `<name>_start`, `<name>_step` and `<name>_learn`
-    do what `OnlineNetwork` does.
+    C89 in double precision without memory allocation: `<name>_start`, `<name>_step` and
+    `<name>_learn` do what `OnlineNetwork` does.
 
     Args:
         model, options: see `OnlineNetwork`.
-        folder: where to write; made if missing.
-        name: of the files, and prefix of all names.
+        folder: where to write; created if missing.
+        name: of the files, and prefix of all identifiers.
 
     Raises:
-        ValueError: see `OnlineNetwork`, or if the name is none of C.
+        ValueError: see `OnlineNetwork`, or if the name is not a valid C identifier.
     """
     if not is_identifier(name):
         raise ValueError(f"`name` must be an identifier of C of up to 31 letters, got {name!r}.")
@@ -205,9 +205,9 @@ def write_online(
 
 
 def _law(learner: OnlineNetwork, dialect: ControllerC) -> tuple[list[str], str]:
-    """Statements of C that fill `slope`, and the expression of the torque, of any one joint."""
+    """C statements that fill `slope`, and the expression for the torque of any one joint."""
     count = len(learner.learnt)
-    # All different, so that nothing looks alike by chance.
+    # All different, so that no two values are equal by chance.
     example = torch.linspace(0.5, 1.5, count + 2, dtype=torch.float64)
     program = trace(
         lambda qd, load, c: law_slopes(learner.model, qd, load, c, learner.learnt),

@@ -2,8 +2,8 @@
 
 One group of a network is searched at a time, in scaled units.
 
-Only the sets remain to be searched, which is shorter and better conditioned than a search over all
-parameters.
+Only the sets have to be searched, which takes fewer steps and is better conditioned than a search
+over all parameters.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FuzzyNetwork = Anfis | AnfisRBF | RBFNetwork
 
 
 def one_group(network: FuzzyNetwork, group: int) -> FuzzyNetwork:
-    """A network of its own with the values of one group of `network`."""
+    """A separate network with the values of one group of `network`."""
     single: FuzzyNetwork = deepcopy(network)
     for module in single.modules():
         if isinstance(module, Anfis | AnfisRBF | RBFNetwork):
@@ -54,7 +54,7 @@ class Scaling:
 
     @classmethod
     def of(cls, x: Tensor, y: Tensor) -> Scaling:
-        """From the ranges of samples, shapes (samples, groups, inputs) and (..., outputs).
+        """Scaling from sample ranges, shapes (samples, groups, inputs) and (..., outputs).
 
         Raises:
             ValueError: if an input never varies; an output that never varies keeps its unit.
@@ -66,31 +66,31 @@ class Scaling:
                 "not out of the network."
             )
         y_middle, y_half = _range(y)
-        # A constant output has no range to be scaled by.
+        # A constant output has no range for scaling.
         return cls(x_middle, x_half, y_middle, torch.where(y_half > 0, y_half, 1.0))
 
     def inverse(self) -> Scaling:
-        """The map from own to scaled, as if own were scaled."""
+        """The inverse map, from own to scaled units."""
         x_half, y_half = 1.0 / self.x_half, 1.0 / self.y_half
         return Scaling(-self.x_middle * x_half, x_half, -self.y_middle * y_half, y_half)
 
     def inputs(self, x: Tensor) -> Tensor:
-        """Scaled inputs of own ones, (*batch, groups, inputs)."""
+        """Scaled inputs from inputs in own units, (*batch, groups, inputs)."""
         return (x - self.x_middle) / self.x_half
 
     def outputs(self, y: Tensor) -> Tensor:
-        """Scaled outputs of own ones, (*batch, groups, outputs)."""
+        """Scaled outputs from outputs in own units, (*batch, groups, outputs)."""
         return (y - self.y_middle) / self.y_half
 
 
 @torch.no_grad()
 def to_own_units(network: FuzzyNetwork, scaling: Scaling) -> None:
-    """Rewrite a network of scaled inputs and outputs as the same one in own units, in place.
+    """Convert a network with scaled inputs and outputs to own units, in place.
 
     Exact: centres, widths and output layers are rewritten. `scaling.inverse()` reverts it.
     """
     if isinstance(network, AnfisRBF):
-        # The head reads inputs and the layer's outputs, and adds to these without a middle.
+        # The head reads inputs and the layer's outputs; its correction has no offset.
         head = Scaling(
             torch.cat([scaling.x_middle, scaling.y_middle], 1),
             torch.cat([scaling.x_half, scaling.y_half], 1),
@@ -106,7 +106,7 @@ def to_own_units(network: FuzzyNetwork, scaling: Scaling) -> None:
 
 
 def _rescale_rbf(network: RBFNetwork, scaling: Scaling) -> None:
-    # Widths scale with the inputs, so that every unit responds exactly as before.
+    # Widths scale with the inputs, so every unit responds exactly as before.
     half = scaling.x_half.unsqueeze(1)
     network.centres.mul_(half).add_(scaling.x_middle.unsqueeze(1))
     network.log_widths.add_(half.log())
@@ -115,7 +115,7 @@ def _rescale_rbf(network: RBFNetwork, scaling: Scaling) -> None:
 
 
 def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
-    # Free sets lie one after the other in a row, input by input.
+    # Free sets are stored one after another in a row, input by input.
     counts = torch.tensor(anfis.terms, device=scaling.x_half.device)
     if isinstance(anfis.partition, FreePartition):
         half = scaling.x_half.repeat_interleave(counts, 1)
@@ -126,7 +126,7 @@ def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
             bound.mul_(scaling.x_half).add_(scaling.x_middle)
     consequents = anfis.consequents
     if anfis.order == 1:
-        # A plane of scaled inputs: slopes absorb the ranges, the offset absorbs the middles.
+        # A plane over scaled inputs: slopes absorb the ranges, the offset absorbs the middles.
         consequents[..., :-1].div_(scaling.x_half[:, None, None])
         moved = consequents[..., :-1] * scaling.x_middle[:, None, None]
         consequents[..., -1].sub_(moved.sum(-1))
@@ -136,7 +136,7 @@ def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
 
 def _range(values: Tensor) -> tuple[Tensor, Tensor]:
     """Middle and half-range over the samples, each (groups, size)."""
-    # Extremes, not deviations: sets then lie on [-1, 1] whatever the distribution.
+    # Extremes, not standard deviations, so sets lie in [-1, 1] for any distribution.
     low, high = values.amin(0), values.amax(0)
     return 0.5 * (low + high), 0.5 * (high - low)
 
@@ -151,14 +151,14 @@ def project(layer: Anfis | RBFNetwork, x: Tensor, y: Tensor, steps: int) -> None
     Args:
         layer: of one group; left alone if its output layer or all of its sets are frozen.
         x, y: samples, shapes (samples, 1, inputs) and (samples, 1, outputs).
-        steps: limit of Levenberg-Marquardt's steps.
+        steps: limit on Levenberg-Marquardt steps.
     Raises:
         KeyboardInterrupt: if interrupted; the best sets so far are in the layer.
     """
     problem = Projection(layer, x, y)
     if not problem.separable:
         return
-    # Only a start for the regularised fit: a tighter tolerance would be wasted.
+    # Only a start for the regularised fit, so a tighter tolerance would be wasted.
     solver = LevenbergMarquardt(max_steps=steps, cost_tolerance=1e-6)
     result = solver.minimise(problem.quadratic, problem.theta, cost=problem.cost)
     # The solver's last trial may not be its best; evaluating it writes the layer.
@@ -172,7 +172,7 @@ class Projection:
 
     Args:
         layer, x, y: as in `project`.
-        ridge: precision of the output layer around zero, over that of the errors.
+        ridge: precision of the output layer around zero, relative to that of the errors.
     """
 
     def __init__(
@@ -186,20 +186,20 @@ class Projection:
         self.moving = ~self.linear
         self.shared = layer.readout().shape[2]
         self.total = layer.jacobian_columns(x[:1]).shape[1]
-        # Of a fixed size, so that memory does not grow with the samples.
+        # Fixed size, so that memory does not grow with the number of samples.
         rows = min(len(x), max(1, CHUNK_ENTRIES // self.total))
-        # Written again and again: the first touch of fresh memory costs more than the arithmetic.
+        # Reused, because first access to new memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
         self.target_squares = y.square().sum()
 
     @property
     def theta(self) -> Tensor:
-        """The layer's present sets (or units) in one vector."""
+        """The layer's current sets (or units) as one vector."""
         return flatten(trainable(self.layer))[self.moving].clone()
 
     @property
     def separable(self) -> bool:
-        """True if there are sets to place, and a whole output layer to eliminate for them."""
+        """True if there are sets to place and the whole output layer can be eliminated."""
         whole = not any(
             name.endswith(LINEAR) and not p.requires_grad
             for name, p in self.layer.named_parameters()
@@ -207,12 +207,12 @@ class Projection:
         return whole and bool(self.moving.any())
 
     def cost(self, theta: Tensor) -> Tensor:
-        """Half the squares, with the ridge's, of the best output layer, which the layer takes."""
+        """Half the sum of squares (with ridge) for the best output layer, which is then set."""
         return self._eliminate(theta)[0]
 
     @torch.no_grad()
     def _eliminate(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost, best output layer (regressors, outputs), and the factor of the regressors' Gram."""
+        """Cost, best output layer (regressors, outputs), and Cholesky factor of the Gram matrix."""
         w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
         assign(self.layer, w)
@@ -223,10 +223,10 @@ class Projection:
             R = self.layer.regressor_columns(self.x[rows], out)[0]
             G.addmm_(R, R.T)
             b.addmm_(R, self.y[rows, 0])
-        # The ridge keeps the Gram matrix definite where sets coincide or no sample fires a rule.
+        # The ridge keeps the Gram matrix positive definite if sets coincide or a rule never fires.
         factor = torch.linalg.cholesky_ex(G + self.ridge * torch.eye(self.shared).to(G)).L
         weights = torch.cholesky_solve(b, factor)
-        # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
+        # An output layer's maps select regressors, so their transpose scatters weights.
         placed = _pulled_back(self._maps()[:, : self.shared], weights)
         w[self.linear] = placed[self.linear]
         assign(self.layer, w)
@@ -248,7 +248,7 @@ class Projection:
             F = self.layer.jacobian_columns(self.x[rows], out)[0]
             A.addmm_(F[shared:], F.T)
             b.addmm_(F[shared:], F[:shared].T @ weights - self.y[rows, 0])
-        # Schur complement: curvature that the re-optimised output layer removes.
+        # Schur complement: curvature removed by re-optimising the output layer.
         explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, factor)
         maps = self._maps()[:, shared:, self.moving]
         hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)

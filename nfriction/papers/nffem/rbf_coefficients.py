@@ -1,4 +1,4 @@
-"""Coefficients by the papers' network: one radial basis network a joint, taught by a controller."""
+"""Coefficients from the papers' network: one RBF network per joint, trained on a controller."""
 
 import math
 from collections.abc import Sequence
@@ -19,36 +19,35 @@ from nfriction.simulation.validate import at_sample_time
 class RBFCoefficients(Schedule):
     """A radial basis network of |velocity| and acceleration gives the coefficients of a law.
 
-    Jerk and snap, the acceleration's first two derivatives, can be further inputs. They are taken
-    of the acceleration through a first-order low pass, snap through another, as causal as in a
-    controller; the hidden state is what these filters carry.
+    Jerk and snap, the first two derivatives of the acceleration, can be further inputs. They are
+    computed after a first-order low-pass filter, and snap after another one, causally as in a
+    controller; the states of these filters are the hidden state.
 
-    Its numbers are those of the network itself, in SI, so what was trained on a controller's
-    outputs is copied in as it is. Inputs are clamped to the universe on which it was trained, the
-    outputs to theirs: a controller never leaves it, a network may. An untrained model is the
-    constant law `initial`.
+    The network works in SI units, so a network trained on a controller's outputs is copied in
+    unchanged. Inputs and outputs are clamped to their universes in training: a controller never
+    leaves its own, but a network may. An untrained model is the constant law `initial`.
 
     Args:
         law: the law whose coefficients these are.
         joints: number of joints.
         initial: coefficients at the start in SI, (joint, coefficient) or (coefficient,).
-        head_units: units of each joint's network; the papers take 10.
-        acceleration: `"along_motion"` takes qdd sgn(qd), `"signed"` qdd as the papers do; jerk and
-            snap alike.
-        derivatives: of the acceleration that are inputs: 0, 1 (jerk) or 2 (and snap).
-        smoothing: time constant of their filters [s]; by default that of 20 Hz.
-        sample_time: at which they are advanced [s].
+        head_units: units of each joint's network; 10 in the papers.
+        acceleration: `"along_motion"` uses qdd sgn(qd), `"signed"` qdd like the papers; likewise
+            for jerk and snap.
+        derivatives: of the acceleration used as inputs: 0, 1 (jerk) or 2 (jerk and snap).
+        smoothing: time constant of their filters [s]; by default for a cut-off of 20 Hz.
+        sample_time: of these filters [s].
 
     References:
-        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 network a joint); its future work
+        TLRIP paper, neuro-fuzzy friction estimation (one 2-10-2 network per joint); its future work
         (jerk and snap).
     """
 
     handles_range = True
     fit_strategy = "nfriction.papers.nffem.fit_rbf:fit_rbf"
 
-    # Final, so that TorchScript takes it for a constant.
-    turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's universe
+    # `Final`, so that it is a constant for TorchScript.
+    turn: Final[float] = 3e-3  # width of the sign in qdd sgn(qd), relative to the velocity universe
     remembers: Final[bool]
 
     input_lower: Tensor
@@ -85,7 +84,7 @@ class RBFCoefficients(Schedule):
         inputs = 2 + self.derivatives
         self.network = RBFNetwork(joints, inputs, head_units, len(law.names))
         values = Constant(law, joints, initial).values
-        # As wide as the papers' motion.
+        # As wide as the motion in the papers.
         size = torch.tensor([20.0, 200.0, 1e4, 1e6], dtype=values.dtype)[:inputs].repeat(joints, 1)
         zero_speed = torch.tensor([0.0, -1.0, -1.0, -1.0], dtype=values.dtype)[:inputs]
         for name, start in (
@@ -95,19 +94,19 @@ class RBFCoefficients(Schedule):
             ("output_upper", values.clone()),
         ):
             self.register_buffer(name, start)
-        # Bias alone: an untrained network is the constant law.
+        # Only the bias is set: an untrained network is the constant law.
         nn.init.zeros_(self.network.output_weight)
         with torch.no_grad():
             self.network.output_bias.copy_(values)
 
     def set_sample_time(self, sample_time: float) -> None:
-        """Set the time between samples [s], from which the filters of jerk and snap follow.
+        """Set the sample time [s], on which the filters of jerk and snap depend.
 
         Raises:
             ValueError: if it is not positive and finite.
         """
         self.step = positive_number("sample_time", sample_time)
-        # A network of velocity and acceleration alone runs at any rate.
+        # A network of only velocity and acceleration runs at any rate.
         self.sample_time = self.step if self.remembers else None
         self.gain = 1.0 - math.exp(-self.step / self.smoothing)
 
@@ -131,7 +130,7 @@ class RBFCoefficients(Schedule):
         return torch.minimum(torch.maximum(y, self.output_lower), self.output_upper)
 
     def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Smoothed acceleration, jerk and snap, (*batch, joint, 1 + derivatives); or nothing."""
+        """Smoothed acceleration, jerk and snap, (*batch, joint, 1 + derivatives), or empty."""
         rest = torch.zeros_like(qdd)
         return torch.stack([qdd, rest, rest], -1).narrow(-1, 0, self.state_size)
 
@@ -152,7 +151,7 @@ class RBFCoefficients(Schedule):
             return at_sample_time(self, float(time.diff().median())).states(qd, qdd)
         if not self.remembers:
             return self.initial_state(qd, qdd)
-        # As in the base class, but without a step of torch to every sample.
+        # As in the base class, but without torch operations for every sample.
         filtered, rate = ([self.gain], [1.0, self.gain - 1.0]), 1.0 / self.step
         start = (1.0 - self.gain) * qdd[:1].numpy()
         found = [lfilter(*filtered, qdd.numpy(), axis=0, zi=start)[0]]
@@ -164,18 +163,18 @@ class RBFCoefficients(Schedule):
 
     @torch.no_grad()
     def set_network(self, network: RBFNetwork, inputs: Tensor, outputs: Tensor) -> None:
-        """Take over a trained network, a group for each joint.
+        """Adopt a trained network with one group per joint.
 
         Args:
             network: from |velocity| and acceleration to the coefficients, in SI.
-            inputs: universe of each input, lower then upper, (2, joint, 2).
-            outputs: of each coefficient, (2, joint, coefficient).
+            inputs: universe of each input, lower then upper ends, (2, joint, 2).
+            outputs: universe of each coefficient, (2, joint, coefficient).
 
         Raises:
-            ValueError: if the network has another shape, a universe is no range, or one of a
-                coefficient that is positive by physics begins below zero.
+            ValueError: if the network has another shape, a universe is empty, or that of a
+                physically positive coefficient begins below zero.
         """
-        # The description has all sizes.
+        # The string contains all sizes.
         ours, theirs = self.network.extra_repr(), network.extra_repr()
         if ours != theirs:
             raise ValueError(f"`network` must have {ours}, got {theirs}.")
@@ -189,7 +188,7 @@ class RBFCoefficients(Schedule):
                     f"`{name}` must be lower and upper ends {shape} with lower <= upper, got shape "
                     f"{tuple(given.shape)}."
                 )
-        # The clamp to the universe is all that keeps such a coefficient positive.
+        # Only the clamp to the universe keeps such a coefficient positive.
         if bool((self.positive & (outputs[0] < 0)).any()):
             raise ValueError("a coefficient that is positive by physics has a universe from >= 0.")
         self.network.load_state_dict(network.state_dict())
@@ -199,7 +198,7 @@ class RBFCoefficients(Schedule):
         self.output_upper.copy_(outputs[1])
 
     def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
-        """The output layer, all that a trajectory fit varies: weights and bias."""
+        """The output layer (weights and bias), which is all that a trajectory fit varies."""
         return self.network.output_weight, self.network.output_bias
 
     def parameter_vector(self) -> Tensor:
@@ -221,14 +220,14 @@ class RBFCoefficients(Schedule):
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        """Derivatives at motions (sample, joint), each sample taken for a first one."""
+        """Derivatives at motions (sample, joint), each sample treated as a first one."""
         return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
 
     @torch.no_grad()
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         x = self.inputs(qd, qdd, state)
         y = self.network(x)
-        # What is clamped does not move.
+        # A clamped output has zero derivatives.
         free = ((y > self.output_lower) & (y < self.output_upper)).to(y.dtype)
         moving = ((x > self.input_lower) & (x < self.input_upper)).to(y.dtype)
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
@@ -251,7 +250,7 @@ class RBFCoefficients(Schedule):
             "head_units": self.head_units,
             "acceleration": "along_motion" if self.along_motion else "signed",
         }
-        # Without further inputs there is nothing to smooth, as in files from before there were any.
+        # Without further inputs nothing is smoothed, as in files older than these inputs.
         if self.remembers:
             found |= {
                 "derivatives": self.derivatives,

@@ -1,7 +1,7 @@
 """Fuzzy networks trained by Bayesian regularisation, on samples or on a controller's outputs.
 
 The papers' last step: a rule-table controller is sampled over its universes, and a network learns
-its outputs, without a validation set. Groups (joints) are trained one after the other.
+its outputs without a validation set. Groups (joints) are trained one after another.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from nfriction.papers.nffem.projection import (
 )
 
 GAUSSIAN = ("gaussian", "left_shoulder", "right_shoulder")
-# Size of the random move to another start, in units of the scaled inputs or of logarithms.
+# Size of the random perturbation for another start, in units of scaled inputs or of logarithms.
 SHAKE = 0.3
-# The few samples of the search leave the sets almost where all samples want them.
+# The few samples of the search place the sets almost where all samples would.
 REFINING_STEPS, PROJECTED_STEPS = 10, 3
-# Steps times samples that a start is regularised for, to be ranked by its evidence: the precisions
-# are first estimated after one step and good enough for a ranking after another, but few samples
-# need many steps and cost little.
+# Steps times samples of the regularisation that ranks a start by its evidence: precisions are first
+# estimated after one step and are good enough for a ranking after another, but few samples need
+# many steps, which cost little.
 RANKING_EFFORT = 120_000
 
 
@@ -46,20 +46,20 @@ RANKING_EFFORT = 120_000
 class TrainingOptions(EvidenceOptions):
     """Settings of a training; those of Bayesian regularisation are in scaled units.
 
-    Sets (or units) are first moved with the output layer eliminated, from several starts, on few
-    samples and then a little on all; the start with the largest evidence is regularised.
+    Sets (or units) are first optimised from several starts with the output layer eliminated, on few
+    samples and then briefly on all; the start with the largest evidence is regularised.
 
     Attributes:
-        seed: of the samples of controllers, and of the starts after the first: shaken sets, or
-            k-means anew.
-        starts: how many.
-        search_samples, search_steps: evenly thinned samples, and steps, to compare starts with.
-            Without regularisation these steps overfit where samples are hardly more than
-            parameters; `search_steps=0` then often ends at a larger evidence.
-        max_steps: limit of the steps of Bayesian regularisation on all samples.
+        seed: for the samples of controllers, and for starts after the first: perturbed sets, or
+            another k-means.
+        starts: number of starts.
+        search_samples, search_steps: numbers of evenly thinned samples and of steps for comparing
+            starts. Without regularisation these steps overfit if there are hardly more samples
+            than parameters; `search_steps=0` then often ends at a larger evidence.
+        max_steps: limit on steps of Bayesian regularisation on all samples.
 
     Raises:
-        ValueError: if there is no start or no sample, or see `EvidenceOptions`.
+        ValueError: if there is no start or no sample; see also `EvidenceOptions`.
     """
 
     max_steps: int = 30
@@ -83,7 +83,7 @@ DEFAULTS = TrainingOptions()
 def recorded_losses(
     names: Sequence[str],
 ) -> tuple[dict[str, list[float]], Callable[[EvidenceState], None]]:
-    """Mean squared error after every step by the name of its group, and the callback for it."""
+    """Mean squared error after every step by group name, and the callback that records it."""
     losses: dict[str, list[float]] = {}
 
     def keep(state: EvidenceState) -> None:
@@ -101,9 +101,9 @@ def controller_targets(
     """Inputs drawn evenly over a controller's universes, and its outputs.
 
     Args:
-        controller: as the papers', of |velocity| and acceleration, or any other.
-        samples: how many; the paper takes 40,000.
-        seed: of the draw.
+        controller: of |velocity| and acceleration, as in the papers, or any other.
+        samples: number of samples; 40,000 in the paper.
+        seed: of the random draw.
     Returns:
         x, shape (samples, inputs), in SI (rad/s, rad/s^2), and y, shape (samples, outputs).
     """
@@ -125,12 +125,12 @@ def train_on_controller(
 ) -> list[EvidenceResult]:
     """Train a network, in place, on the outputs of fuzzy controllers: the papers' last step.
 
-    An ANFIS starts from a controller's own sets where it has as many, else from an even grid over
-    the universes; a radial basis network from units chosen by orthogonal least squares.
+    An ANFIS starts from a controller's own sets if it has as many, otherwise from an even grid over
+    the universes; a radial basis network starts from units chosen by orthogonal least squares.
 
     Args:
-        network: from inputs in SI to outputs in SI, a group for each controller.
-        controllers: one for each group.
+        network: from inputs in SI to outputs in SI, with one group per controller.
+        controllers: one per group.
         samples: see `controller_targets`; group g draws with seed + g.
         options: see `train_network`.
 
@@ -139,7 +139,7 @@ def train_on_controller(
         interrupt or the callback ended the training.
 
     References:
-        TLRIP paper, neuro-fuzzy friction estimation (40,000 samples a joint, 2-10-2 network).
+        TLRIP paper, neuro-fuzzy friction estimation (40,000 samples per joint, 2-10-2 network).
     """
     given = [controllers] if isinstance(controllers, MamdaniController) else list(controllers)
     if len(given) != network.groups or any(
@@ -152,7 +152,7 @@ def train_on_controller(
     drawn = [controller_targets(c, samples, options.seed + g) for g, c in enumerate(given)]
     x, y = (torch.stack(parts, 1) for parts in zip(*drawn, strict=True))
     if isinstance(network, RBFNetwork):
-        # Units at samples, each where it explains most of what the others leave.
+        # Units at samples, each where it best explains the residual of the others.
         network.init_ols(x, y, width=0.5)
     else:
         _take_sets(network.anfis if isinstance(network, AnfisRBF) else network, given)
@@ -162,30 +162,30 @@ def train_on_controller(
 def train_network(
     network: FuzzyNetwork, x: Tensor, y: Tensor, options: TrainingOptions = DEFAULTS
 ) -> list[EvidenceResult]:
-    """Train a network in place on samples by Bayesian regularisation, each group for itself.
+    """Train a network in place on samples by Bayesian regularisation, each group separately.
 
-    Every kind of parameter has its own prior: centres, widths and their like around where the best
-    start placed them, output layers around zero (in scaled units).
+    Every kind of parameter has its own prior: for centres, widths and the like, around the values
+    of the best start; for output layers, around zero (in scaled units).
 
     Args:
-        network: as its sets (or units) should start; the output layer needs no start.
+        network: with initial sets (or units); the output layer needs no initial values.
         x: inputs, shape (samples, groups, inputs).
         y: targets, shape (samples, groups, outputs).
         options: starts, steps and the callback.
 
     Returns:
         The result of each group in scaled units, inputs and outputs on [-1, 1]; fewer if an
-        interrupt or the callback ended the training. The groups after it then have the
-        least-squares output layer for their first sets.
+        interrupt or the callback ended the training. Later groups then have the
+        least-squares output layer for their initial sets.
 
     Raises:
-        ValueError: if samples do not fit the network, are not finite, or an input never varies.
+        ValueError: if samples do not match the network or are not finite, or an input never varies.
     """
     _check(network, x, y)
     scaling = Scaling.of(x, y)
     x, y = scaling.inputs(x), scaling.outputs(y)
     groups = [NetworkGroup(network, g, scaling, x, y) for g in range(network.groups)]
-    # All groups get a usable network before the long part, which an interrupt may end.
+    # All groups get a usable network before the long part, which may be interrupted.
     for group in groups:
         group.solve_linear(options.search_samples)
     fits: list[EvidenceResult] = []
@@ -203,7 +203,7 @@ def train_network(
 
 @torch.no_grad()
 def _take_sets(anfis: Anfis, controllers: Sequence[MamdaniController]) -> None:
-    """The controllers' own sets where they are Gaussian and as many, else even grids."""
+    """Use the controllers' own sets if Gaussian and equally many, otherwise even grids."""
     lower = torch.stack([c.lower * c.si_factor for c in controllers])
     upper = torch.stack([c.upper * c.si_factor for c in controllers])
     variables = [c.rule_base.inputs for c in controllers]
@@ -256,24 +256,24 @@ class NetworkGroup:
 
     @property
     def carrier(self) -> Anfis | RBFNetwork:
-        """The layer that is placed first; a head comes after."""
+        """The layer that is placed first; a head follows."""
         return self.layer.anfis if isinstance(self.layer, AnfisRBF) else self.layer
 
     def solve_linear(self, samples: int) -> None:
-        """Least-squares output layer for the present sets, written into the network."""
+        """Write the least-squares output layer for the current sets into the network."""
         x, y = self._thinned(samples)
         if isinstance(self.carrier, Anfis):
             self.carrier.solve_consequents(x, y)
         else:
             self.carrier.solve_output(x, y)
         if isinstance(self.layer, AnfisRBF):
-            # The layer alone is usable; a head from its random start would spoil it.
+            # The layer alone is usable; a randomly initialised head would spoil it.
             nn.init.zeros_(self.layer.head.output_weight)
             nn.init.zeros_(self.layer.head.output_bias)
         self.write_back()
 
     def search(self, options: TrainingOptions) -> dict[str, Tensor]:
-        """Give the carrier the start of the largest evidence; return where its sets started."""
+        """Set the carrier to the start with the largest evidence; return its initial sets."""
         few = self._thinned(options.search_samples)
         refining = REFINING_STEPS if options.starts == 1 else PROJECTED_STEPS
         ranking = max(3, min(options.max_steps, RANKING_EFFORT // len(self.x)))
@@ -287,11 +287,11 @@ class NetworkGroup:
             start = _moving(trial)
             project(trial, *few, options.search_steps)
             if len(few[0]) < len(self.x):
-                # The thinned samples placed the sets; the rest only refines them.
+                # The thinned samples placed the sets; all samples only refine them.
                 project(trial, self.x, self.y, refining)
             evidence = 0.0
             if options.starts > 1:
-                # On all samples: on few, the start that overfits them would win.
+                # On all samples: with few, a start that overfits them would win.
                 ranked = EvidenceOptions(max_steps=ranking)
                 evidence = _regularised(trial, self.x, self.y, start, ranked).log_evidence
             if evidence > best:
@@ -300,7 +300,7 @@ class NetworkGroup:
         return prior
 
     def regularise(self, prior: dict[str, Tensor], options: TrainingOptions) -> EvidenceResult:
-        """Bayesian regularisation on all samples, after placing a head where there is one."""
+        """Bayesian regularisation on all samples, after placing the head if there is one."""
         if isinstance(self.layer, AnfisRBF):
             self.layer.init_head(self.x, options.seed)
             self.layer.solve_head(self.x, self.y)
@@ -310,17 +310,17 @@ class NetworkGroup:
 
     def _thinned(self, most: int) -> tuple[Tensor, Tensor]:
         """At most `most` samples, evenly spaced."""
-        # Rounded up, so that the limit holds.
+        # Rounded up, so that the limit is respected.
         every = -(-len(self.x) // most)
         return self.x[::every].contiguous(), self.y[::every].contiguous()
 
     @torch.no_grad()
     def write_back(self) -> None:
         """Copy the layer into its group of the network, in the samples' own units."""
-        # Training goes on in scaled units.
+        # Training continues in scaled units.
         own = deepcopy(self.layer)
         to_own_units(own, self.scaling)
-        # The variables themselves, as copies would leave the network unchanged.
+        # The parameters themselves, as writing to copies would leave the network unchanged.
         ours = self.network.state_dict(keep_vars=True)
         for name, value in own.state_dict().items():
             ours[name][self.group : self.group + 1] = value
@@ -329,14 +329,14 @@ class NetworkGroup:
 def _regularised(
     layer: FuzzyNetwork, x: Tensor, y: Tensor, prior: dict[str, Tensor], options: EvidenceOptions
 ) -> EvidenceResult:
-    """Bayesian regularisation with a prior of its own for each kind of parameter."""
+    """Bayesian regularisation with a separate prior for each kind of parameter."""
     # Frozen parameters have no prior.
     wanted = {name: prior[name] for name in trainable(layer) if name in prior}
     return bayesian_regularisation(layer, x, y, kind=_kind, prior=wanted, options=options)
 
 
 def _kind(name: str) -> str:
-    """Group of a parameter: each kind has a scale of its own, for which the evidence decides."""
+    """Group of a parameter: each kind has its own scale, determined by the evidence."""
     part = {"spacings": "centres", "log_widths": "widths", "log_slopes": "slopes"}
     last = name.rsplit(".", 1)[-1]
     kind = "outputs" if last.startswith("output_") else part.get(last, last)
@@ -354,7 +354,7 @@ def _moving(layer: nn.Module) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def _restart(layer: Anfis | RBFNetwork, x: Tensor, seed: int) -> None:
-    """Another start: units by k-means anew, sets shaken."""
+    """Another start: units from a new k-means, or perturbed sets."""
     if isinstance(layer, RBFNetwork):
         layer.init_kmeans(x, seed)
         return

@@ -1,4 +1,4 @@
-"""Checks by the twins: independent simulations without friction, and the true friction torque."""
+"""Checks using the twins: independent frictionless simulations, and the true friction torque."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SPEED_CELLS, ACCELERATION_CELLS = 40, 6
 
 
 def simulations(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> dict[str, Array]:
-    """Frictionless motions at 1 ms by the library, the twin's mechanics and, if there, MuJoCo.
+    """Frictionless motions at 1 ms by the library, the twin's mechanics and, if installed, MuJoCo.
 
     Args:
         plant: a chain of three links with its arm fixed.
         q0, qd0: release in joint coordinates [rad, rad/s].
-        steps: samples after the release.
+        steps: number of samples after the release.
 
     Returns:
         Joint angles by simulation, each (steps + 1, joint); MuJoCo needs `pip install
@@ -48,10 +48,10 @@ def simulations(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> dict
 
 
 def agreement(plant: PendulumChain, q0: Array, qd0: Array) -> pd.DataFrame:
-    """Largest difference from the library's motion until each horizon [rad], a row a simulation.
+    """Largest difference from the library's motion up to each horizon [rad], by simulation.
 
-    The last row starts off by 1e-12 rad: a chaotic motion enlarges rounding, so no two programs
-    agree better than that for long.
+    The last row is for a start off by 1e-12 rad: chaotic motion amplifies round-off, so no two
+    programs agree better than that for long.
 
     References:
         TLRIP paper, Figs. 3 and 4: equations and SimMechanics "match exactly".
@@ -73,7 +73,7 @@ def agreement(plant: PendulumChain, q0: Array, qd0: Array) -> pd.DataFrame:
 
 
 def _by_mujoco(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> Array:
-    import mujoco  # an extra
+    import mujoco  # an optional dependency
 
     model: Any = mujoco.MjModel.from_xml_string(_mjcf(plant))
     data = mujoco.MjData(model)
@@ -91,7 +91,7 @@ def _mjcf(plant: PendulumChain) -> str:
     for k in reversed(range(plant.links)):
         place = f"{given['length'][k - 1]!r} 0 0" if k else "0 0 0"
         frame = "" if k else 'xyaxes="0 0 1 0 -1 0"'
-        # In a plane only Izz counts; a ball of it is a possible body.
+        # In a plane only Izz matters; a sphere with this inertia is physically valid.
         izz = given["inertia"][k]
         inner = (
             f'<body pos="{place}" {frame}><joint type="hinge" axis="0 0 1"/>'
@@ -106,18 +106,18 @@ def _mjcf(plant: PendulumChain) -> str:
 
 
 def missed_torque(twin: Twin) -> dict[str, float]:
-    """Share of the true friction torque that tables over speed, and acceleration too, miss.
+    """Fraction of the true friction torque missed by tables over speed (and acceleration).
 
-    A table holds the mean torque of cells with equally many samples of the training motion and
+    A table contains the mean torque in cells with equally many samples of the training motion and
     predicts the torque along the test motion. No coefficients of the same inputs can do much
-    better, so this is the cost of the inputs, whatever the network.
+    better, so this is the cost of the choice of inputs, for any network.
 
     Args:
-        twin: with releases of both splits; its truth is only judged by.
+        twin: with releases of both splits; its truth is used only for testing.
 
     Returns:
-        Root mean square error over that of the torque, averaged over the joints, of "speed" and of
-        "speed and acceleration" (along the motion).
+        Ratio of RMS error to RMS torque, averaged over the joints, for "speed" and for "speed and
+        acceleration" (along the motion).
     """
     train, test = _motion(twin, "train"), _motion(twin, "test")
     shares = [_shares(train[:, :, k], test[:, :, k]) for k in range(twin.plant.joints)]
@@ -133,14 +133,14 @@ def _motion(twin: Twin, split: Split) -> Array:
 
 
 def _shares(train: Array, test: Array) -> tuple[float, float]:
-    """Shares of one joint's torque that the two tables miss."""
+    """Fractions of one joint's torque that the two tables miss."""
     cells = []
     for row, count in ((0, SPEED_CELLS), (1, ACCELERATION_CELLS)):
         borders = np.quantile(train[row], np.linspace(0, 1, count + 1)[1:-1])
         cells.append([np.digitize(part[row], borders) for part in (train, test)])
     speed, acceleration = cells
     both = [ACCELERATION_CELLS * v + a for v, a in zip(speed, acceleration, strict=True)]
-    # Cells that training never visited have no mean to judge.
+    # Cells that training never visited have no mean to test.
     seen = np.isin(both[1], both[0])
     wanted = test[2, seen]
 

@@ -27,24 +27,24 @@ from nfriction.recording.angles import AngleConvention
 from nfriction.simulation.rollout import rollout
 
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
-"""Held-out recordings that the figures show: the poses of the papers' own model checks."""
-SECOND_SECONDS = 10.0  # as the RTIP paper shows
+"""Test recordings shown in the figures: from the poses of the papers' own model checks."""
+SECOND_SECONDS = 10.0  # as shown in the RTIP paper
 INERTIA_SECONDS = 3.0
-"""Beyond this a frictionless swing from upright shows rounding rather than inertia."""
+"""Beyond this, a frictionless swing from upright shows round-off rather than inertia."""
 WITHOUT_FRICTION_SECONDS = 6.0
-"""Then the motion without friction has nothing in common with the measured one any more."""
+"""After this, frictionless motion has nothing in common with the measured one."""
 FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
-"""Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
+"""Ixx, Iyy, Izz, products of each link [kg m^2]: Izz as printed across it, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
-_POINTS = 600  # of a membership's line
-_CELLS = 81  # of a map along each axis
+_POINTS = 600  # points of a membership curve
+_CELLS = 81  # cells of a map along each axis
 
 
 def inertia_cases() -> Figure:
-    """Frictionless swings of the TLRIP rig with its arm free, a panel a joint.
+    """Frictionless swings of the TLRIP rig with its arm free, one panel per joint.
 
-    Links as point masses, with the printed Izz alone, and with a full tensor (`FULL_TENSOR`; the
-    paper prints none). The last two nearly agree while the arm turns slowly, and part later.
+    Links as point masses, with only the printed Izz, and with a full tensor (`FULL_TENSOR`; the
+    paper prints none). The last two nearly agree while the arm turns slowly, and diverge later.
 
     References:
         TLRIP paper, Fig. 2.
@@ -58,9 +58,9 @@ def inertia_cases() -> Figure:
 
 
 def second_swing() -> Figure:
-    """Frictionless swing of the RTIP rig with its arm free, a panel a joint.
+    """Frictionless swing of the RTIP rig with its arm free, one panel per joint.
 
-    The angles count from hanging, as in that paper.
+    Angles are measured from hanging, as in that paper.
 
     References:
         RTIP paper, Fig. 3.
@@ -69,7 +69,7 @@ def second_swing() -> Figure:
 
 
 def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
-    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees as they count."""
+    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40° in their convention."""
     q0 = np.deg2rad([0.0, 20.0, 30.0, 40.0])
     figure, axes = style.panels(len(q0), 1, style.PAGE, 1.3 * len(q0), sharex=True)
     looks = style.looks(plants)
@@ -94,8 +94,8 @@ def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
 def without_friction(workspace: Workspace) -> Figure:
     """Measured positions and frictionless simulations from the same release.
 
-    One simulation is the library's, one the twin's own mechanics, which share no code with it, one
-    MuJoCo's where it is installed; the paper compares its equations with SimMechanics.
+    One simulation is by the library, one by the twin's own mechanics, which share no code with it,
+    and one by MuJoCo if installed; the paper compares its equations with SimMechanics.
 
     References:
         TLRIP paper, Fig. 4.
@@ -113,20 +113,20 @@ def without_friction(workspace: Workspace) -> Figure:
     moved = {n: convention.position_from_joint(q) for n, q in simulated.items()}
     figure = motion(first, {name: _score(first, q) for name, q in moved.items()})
     for ax in figure.axes:
-        # Here the simulations that leave the measured motion are what is to be seen.
+        # The simulations that leave the measured motion should be visible here.
         ax.autoscale(axis="y")
     return figure
 
 
 def network_surfaces(workspace: Workspace) -> Figure:
-    """B and C as the papers' networks learnt them from the controllers, a row a joint."""
+    """B and C as learnt from the controllers by the papers' networks, one row per joint."""
     model = load(workspace.model("NFLFM-papers"))
     schedule = model.schedule
     assert isinstance(schedule, RBFCoefficients)
     figure, axes = style.panels(model.joints, 2, style.PAGE, 0.5 + 1.6 * model.joints, sharey="row")
     low, high = schedule.input_lower.numpy(), schedule.input_upper.numpy()
     for joint, row in enumerate(axes):
-        # Speed and acceleration of this joint; the others' do not enter.
+        # Speed and acceleration of this joint; those of other joints are not used.
         x = np.linspace(0.0, high[joint, 0], _CELLS)
         y = np.linspace(low[joint, 1], high[joint, 1], _CELLS)
         qd, qdd = (torch.as_tensor(v)[..., None].expand(_CELLS, _CELLS, model.joints)
@@ -142,7 +142,7 @@ def network_surfaces(workspace: Workspace) -> Figure:
 
 
 def coefficients(workspace: Workspace, name: str) -> Figure:
-    """Coefficients of a neuro-fuzzy model over the friction experiment, a column a joint.
+    """Coefficients of a neuro-fuzzy model over the friction experiment, one column per joint.
 
     References:
         TLRIP paper, Figs. 11 to 13.
@@ -155,7 +155,7 @@ def coefficients(workspace: Workspace, name: str) -> Figure:
 def group_positions(
     workspace: Workspace, models: Sequence[str], among: Sequence[str] = tables.NINE
 ) -> Figure:
-    """Measured positions and those simulated by these models, errors on the scale of others too.
+    """Measured and simulated positions of these models, with errors also on the scale of others.
 
     References:
         TLRIP paper, Fig. 14 (of NFNLFM).
@@ -166,7 +166,7 @@ def group_positions(
 
 
 def fresh_errors(workspace: Workspace) -> Figure:
-    """Errors over fresh releases, a panel a joint: all, the middle half, the median."""
+    """Errors over fresh releases, one panel per joint: all, the middle half, the median."""
     errors = tables.fresh_runs(workspace, tables.NINE)
     figure, axes = style.panels(1, len(tables.JOINTS), style.PAGE, 2.3, sharex=True, sharey=True)
     places, looks = range(len(errors)), style.looks(errors)
@@ -175,7 +175,7 @@ def fresh_errors(workspace: Workspace) -> Figure:
     for joint, (ax, name) in enumerate(zip(axes[0], tables.JOINTS, strict=True)):
         runs = 1e3 * np.stack(list(errors.values()))[..., joint]
         for k, (model, own) in enumerate(zip(errors, runs, strict=True)):
-            # Without interpolation: a diverged run is infinitely wrong, and ends beyond all others.
+            # Without interpolation: the error of a diverged run is infinite, beyond all others.
             ends = np.percentile(own, [0, 25, 75, 100], method="nearest")
             least, low, high, most = np.minimum(ends, beyond)
             colour = looks[model].line["color"]
@@ -194,7 +194,7 @@ def fresh_errors(workspace: Workspace) -> Figure:
 
 
 def second_torque(workspace: Workspace) -> Figure:
-    """Friction torque of each law over velocity on the second paper's rig, a panel a joint.
+    """Friction torque of each law over velocity on the second paper's rig, one panel per joint.
 
     References:
         RTIP paper, Fig. 8.
@@ -205,7 +205,7 @@ def second_torque(workspace: Workspace) -> Figure:
 
 
 def experiment(workspace: Workspace) -> Figure:
-    """Position, velocity and acceleration of the friction experiment, a column a joint.
+    """Position, velocity and acceleration of the friction experiment, one column per joint.
 
     Shaded by the class of acceleration found; a strip at the top shows the printed classes.
 
@@ -233,7 +233,7 @@ def experiment(workspace: Workspace) -> Figure:
         style.title(axes[0, joint], name)
         axes[-1, joint].set_xlabel("time [s]")
         for known, start, stop in tables.TABLE_6[name]:
-            # A short run ends before the printed intervals do.
+            # A short run ends before the printed intervals.
             if start < end:
                 axes[0, joint].axvspan(
                     start, min(stop, end), ymin=0.93, facecolor=CLASS_COLOURS[known],
@@ -250,7 +250,7 @@ def experiment(workspace: Workspace) -> Figure:
 
 
 def controller_memberships() -> Figure:
-    """Fuzzy sets of the inputs and outputs of joint 2's controller, a panel each.
+    """Fuzzy sets of the inputs and outputs of joint 2's controller, one panel each.
 
     References:
         TLRIP paper, Fig. 7 and Table 4.
@@ -281,11 +281,11 @@ def second_positions(workspace: Workspace, law: str) -> Figure:
 def _on_one_scale(
     recording: Recording, simulated: Mapping[str, Array], shown: Sequence[str]
 ) -> Figure:
-    """Positions by the models shown, errors on the scale of all, to compare figures by eye."""
+    """Positions of the models shown, with errors on a common scale, to compare figures by eye."""
     figure = positions(recording, {name: _score(recording, simulated[name]) for name in shown})
     errors = np.abs(np.stack(list(simulated.values())) - recording.q)
     largest = np.where(np.isfinite(errors), errors, 0.0).max((0, 1))
-    # A model that diverges must not flatten all others.
+    # A model that diverges must not flatten the curves of all others.
     largest = np.minimum(largest, 0.5 * np.ptp(recording.q, axis=0))
     for ax, most in zip(figure.axes[1::2], 1e3 * largest, strict=True):
         ax.set_ylim(style.padded(-most, most))
@@ -309,7 +309,7 @@ def _score(recording: Recording, simulated: Array) -> Score:
 def _sets(ax: Axes, variable: Variable) -> None:
     low, high = variable.universe
     x = torch.linspace(low, high, _POINTS, dtype=torch.float64)
-    # The papers give inputs in degrees, which take no prefix.
+    # The papers give inputs in degrees, which need no SI prefix.
     is_input = "deg" in variable.unit
     factor, unit = (1.0, variable.unit) if is_input else style.scaled(variable.unit, [low, high])
     colours = style.COLOURS

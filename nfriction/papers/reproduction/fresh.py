@@ -1,7 +1,7 @@
-"""Fresh releases of the TLRIP twin, by which models are put in order.
+"""Fresh releases of the TLRIP twin, used to rank models.
 
-Two releases leave the order to chance, as one of them is from upright, where the motion amplifies
-every error. These ten can be predicted.
+With two releases the ranking is left to chance, as one is from upright, where the motion amplifies
+every error. These ten are predictable.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ from nfriction.simulation.validate import required_substeps
 
 Array = NDArray[np.float64]
 
-# Joint angles [deg], released at rest. Drawn as in the family of twins, and taken by the truth
-# alone: off by an encoder's count at every joint, they stay within 16 counts for 10 s.
+# Joint angles [deg], released at rest. Drawn as in the family of twins, and selected only by the
+# truth: starting one encoder count off at every joint, they stay within 16 counts for 10 s.
 POSES = (
     (147.7, 37.5, 50.8), (159.0, -3.5, 27.4), (116.4, 53.5, -7.8), (204.9, -1.4, 13.2),
     (107.0, -50.7, -1.2), (117.1, 5.4, 30.0), (248.2, -41.7, -42.6), (147.5, 34.2, 47.5),
@@ -41,7 +41,7 @@ def true_positions(seconds: float) -> Array:
 
 
 def free_run_errors(plant: Plant, model: FrictionModel, true: Array) -> list[list[float | None]]:
-    """RMSE of free runs by release and joint [rad]; None where a simulation diverges."""
+    """RMSE of free runs by release and joint [rad]; None if a simulation diverges."""
     start = torch.tensor(true[:, 0])
     run = rollout(
         plant, model, start, torch.zeros_like(start), sample_time=1 / RATE,

@@ -39,11 +39,11 @@ class Item:
     """A table or figure of a paper.
 
     Attributes:
-        title: its number and the content of its caption.
+        title: its number and caption.
         differs: difference between ours and the paper's, if there is one.
-        tables: caption and content, by the name of the file.
-        figures: by the name of the file.
-        models: models whose fits' status the page lists.
+        tables: caption and content, by file name.
+        figures: by file name.
+        models: models whose fit status is listed on the page.
     """
 
     title: str
@@ -58,17 +58,17 @@ FIRST = (
          "No full tensor is printed; ours has Izz across and a tenth of it along each link.",
          figures={"fig_02_inertia": lambda _: figures.inertia_cases()}),
     Item("Fig. 4: model without friction, an independent simulation and the measured motion",
-         "MuJoCo takes the place of SimMechanics, the twin that of the measured motion.",
+         "MuJoCo replaces SimMechanics, and the twin replaces the measured motion.",
          {"fig_4_agreement": (
-             "Fig. 4: difference from our simulation without friction, from 20.56°, 32.21°, 45°",
+             "Fig. 4: difference from our frictionless simulation, released at 20.56°, 32.21°, 45°",
              lambda _: tables.agreement_table())},
          {"fig_04_without_friction": figures.without_friction}),
     Item("Table 6 and the experiment: classes of acceleration over time",
-         "The experiment is a release from upright, the reading of 180° that fits Table 4.",
+         "The experiment is a release from upright, the reading of 180° that agrees with Table 4.",
          {"table_6": ("Table 6: classes of acceleration in the experiment", tables.table_6)},
          {"experiment_classes": figures.experiment}),
     Item("Tables 7, 8, 9: adaptive coefficients by class",
-         "The printed ones are lost in the scan. The paper uses pattern search; the papers' "
+         "The printed ones are illegible in the scan. The paper uses pattern search; the papers' "
          "networks start from the coefficients found by Gauss-Newton.",
          {f"table_{number}": (
              f"Table {number}: coefficients of A{law} by class of acceleration (the print is lost)",
@@ -82,7 +82,7 @@ FIRST = (
                   lambda _, joint=joint: controller_surface(paper_controller(joint))  # type: ignore[misc]
                   for joint in (2, 3, 4)}),
     Item("Networks 2-10-2 after their training on the controllers' outputs",
-         "Not shown in the paper. Controllers here span the coefficients by class of the twin.",
+         "Not shown in the paper. The controllers span the twin's coefficients by class.",
          figures={"networks_NFLFM": figures.network_surfaces}, models=("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          "Where a network did not pass its hold-out windows, its constant law is kept.",
@@ -90,12 +90,12 @@ FIRST = (
                   for number, name in zip((11, 12, 13), NEURO_FUZZY, strict=True)},
          models=NEURO_FUZZY),
     Item("Fig. 14: measured and simulated position",
-         "On a recording that no model was fitted to.",
+         "On a recording to which no model was fitted.",
          figures={f"fig_14_positions_{NEURO_FUZZY[-1]}":
                   partial(figures.group_positions, models=NEURO_FUZZY[-1:],
                           among=NEURO_FUZZY[-1:])}),
     Item("Table 10: position error of every model",
-         "The printed numbers cannot be reproduced, since the friction is that of another machine. "
+         "The printed numbers cannot be reproduced, since the friction is from a different rig. "
          "-pattern: by the papers' pattern search; -papers: by their fuzzy controller and network. "
          "The figure shows ten fresh releases: median, middle half and all.",
          {"table_10": (
@@ -108,12 +108,12 @@ FIRST = (
              "Table 10 again, coefficients driven by the measured motion as in the paper [mrad]",
              partial(tables.table_10, drive="measured_drive"))},
          {"rmse": figures.fresh_errors}),
-    Item("Table 11: error of NFNLFM below that of each other model",
+    Item("Table 11: error reduction by NFNLFM relative to each other model",
          tables={
-             "table_11": ("Table 11: error of NFNLFM below that of each other model [%], median of "
-                          "ten fresh releases", tables.table_11),
-             "error_saved": ("error saved by coefficients by class and by networks within a law "
-                             "[%], median of ten fresh releases", tables.steps_saved)}),
+             "table_11": ("Table 11: error reduction by NFNLFM relative to each other model [%], "
+                          "median of ten fresh releases", tables.table_11),
+             "error_saved": ("error reduction by coefficients by class and by networks for each "
+                             "law [%], median of ten fresh releases", tables.steps_saved)}),
 )  # fmt: skip
 SECOND = (
     Item("Fig. 3: four joints from 0°, 20°, 30°, 40°",
@@ -126,8 +126,8 @@ SECOND = (
               ("I", "II", "III"), LAWS,
               ("sequential quadratic programming", "pattern search", "pattern search"),
               strict=True)}),
-    Item("Figs. 5, 6, 7: measured and simulated position, first 10 s, one scale of error",
-         "From 20°, 30°, 40°, which no model was fitted to; the paper shows its own fit from 45°.",
+    Item("Figs. 5, 6, 7: measured and simulated position, first 10 s, common error scale",
+         "From 20°, 30°, 40°, to which no model was fitted; the paper shows its own fit from 45°.",
          figures={f"second_fig_{number}_{law}": partial(figures.second_positions, law=law)
                   for number, law in zip((5, 6, 7), LAWS, strict=True)}),
     Item("Fig. 8: friction torque over velocity",
@@ -140,7 +140,7 @@ SECOND = (
              tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad")}),
 )  # fmt: skip
 TASKS = {
-    "still": "a link balanced upright, the arm to stay still",
+    "still": "a link balanced upright with the arm held still",
     "follow": "a link balanced upright while the arm follows a slow sine",
     "swing-up": "three links swung up in 5 s and balanced, planned with the same friction",
     "three links": "three links balanced upright while the arm follows a slow sine",
@@ -171,7 +171,7 @@ SWING_UP = "control_swing_up"
 
 
 def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
-    """Caption and content of every table, by the name of its file."""
+    """Caption and content of every table, by file name."""
     return {
         name: (caption, make(workspace))
         for item in ITEMS
@@ -205,7 +205,7 @@ def text(workspace: Workspace) -> str:
     ]
     parts.append(
         "printed: the papers' numbers, from recordings that were never published, with the "
-        "friction of another\nmachine; ours: simulated twins. -papers: by the papers' own "
+        "friction of another\nrig; ours: from simulated twins. -papers: by the papers' own "
         "procedure (fuzzy controller, 2-10-2 network),\n-pattern: by their pattern search."
     )
     return "\n\n".join([*parts, f"how the fits ended\n{tables.fit_ends(workspace)}"])
@@ -234,7 +234,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
 
 
 def write_page(workspace: Workspace) -> Path:
-    """Write `reproduction.html` with the tables, and the figures that were drawn."""
+    """Write `reproduction.html` with the tables and the figures that were drawn."""
     made = all_tables(workspace)
     parts = [
         (title, [_rendered(workspace, made, item) for item in items]) for title, items in PARTS
@@ -251,7 +251,7 @@ def write_page(workspace: Workspace) -> Path:
 def _rendered(
     workspace: Workspace, made: Mapping[str, tuple[str, pd.DataFrame]], item: Item
 ) -> dict[str, Any]:
-    """An item's tables with cells of text, and its pictures as URLs."""
+    """An item's tables with cells as text, and its pictures as URLs."""
     ends = [f"{name}: {workspace.found(name)['fit']['status']}" for name in item.models]
     shown = [made[name] for name in item.tables]
     pictures = {
@@ -269,12 +269,12 @@ def _rendered(
 
 
 def _shown(caption: str, table: pd.DataFrame) -> pd.DataFrame:
-    # Coefficients stay in SI; errors are read in thousandths.
+    # Coefficients stay in SI; errors are shown in thousandths.
     return 1e3 * table if "[mrad]" in caption else table
 
 
 def _flat(table: pd.DataFrame) -> pd.DataFrame:
-    # One header row, so that any reader of CSV can read it.
+    # One header row, so that any CSV reader can read it.
     return table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
 
 

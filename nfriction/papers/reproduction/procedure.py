@@ -22,7 +22,7 @@ from nfriction.signals import Motion
 
 Ranges = list[tuple[float, float]]
 
-# Classes that agree leave an output without a universe; it then is this share of its value wide.
+# If classes agree, the universe of an output would be empty; it then has this relative width.
 NARROWEST = 0.01
 
 
@@ -36,20 +36,20 @@ def papers_neuro_fuzzy(
 ) -> tuple[NeuroFuzzyModel, list[EvidenceResult]]:
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
-    The coefficients by class span the outputs of a fuzzy controller with the papers' rules, the
-    motion its inputs; the controller's outputs along the measured motion then teach a radial basis
-    network a joint by Bayesian regularisation.
+    The coefficients by class define the output ranges of a fuzzy controller with the papers' rules,
+    and the motion its input ranges; one radial basis network per joint is then trained on the
+    controller's outputs along the measured motion, by Bayesian regularisation.
 
     Args:
         adaptive: fitted, with coefficients for each class of acceleration.
-        motions: of the recordings behind it, in joint coordinates.
-        samples: most a joint, evenly thinned from the motions.
+        motions: of the recordings that it was fitted to, in joint coordinates.
+        samples: largest number per joint, evenly thinned from the motions.
         units: of the network.
         options: of its training, see `train_network`.
 
     Returns:
-        A model of the same law with the network for its schedule, without gradients; and the fit
-        of each joint's network.
+        A model of the same law with the network as its schedule, without gradients, and the fit of
+        each joint's network.
 
     Raises:
         ValueError: if the model is not adaptive, its law has no neuro-fuzzy model, or `samples` is
@@ -64,12 +64,12 @@ def papers_neuro_fuzzy(
         )
     if samples < 1:
         raise ValueError(f"`samples` must be at least 1, got {samples}.")
-    # One after the other: the times matter to nobody here.
+    # Concatenated: the times are not used here.
     time, q, qd, qdd = (
         np.concatenate([getattr(m, key) for m in motions]) for key in ("time", "q", "qd", "qdd")
     )
     controllers = controllers_from_classes(adaptive.law, adaptive.schedule.values, qd, qdd)
-    # Rounded up, so that the limit holds.
+    # Rounded up, so that the limit is respected.
     measured = sampled(
         controllers,
         Motion(time, q, qd, qdd),
@@ -95,11 +95,11 @@ def train_on_samples(
 
     Args:
         law: of the coefficients that the controllers give.
-        controllers: whose universes the model keeps to, one for each joint.
+        controllers: one per joint; the model stays within their universes.
         samples: along a measured motion.
-        units: of each network; the paper takes 10.
+        units: of each network; 10 in the paper.
         options: of the training, see `train_network`.
-        v_smooth: of the model's sign [rad/s].
+        v_smooth: of the model's smooth sign [rad/s].
 
     Returns:
         The model, without gradients, and the fit of each joint's network.
@@ -108,11 +108,11 @@ def train_on_samples(
         ValueError: if the law has no neuro-fuzzy model.
 
     References:
-        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 networks, 40,000 samples a joint).
+        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 networks, 40,000 samples per joint).
     """
     joints = len(controllers)
     network = RBFNetwork(joints, 2, units, len(law.names))
-    # Units at samples, each where it explains most of what the others leave.
+    # Units at samples, each where it best explains the residual of the others.
     network.init_ols(samples.x, samples.y, width=0.5)
     fits = train_network(network, samples.x, samples.y, options)
     model = _neuro_fuzzy_class(law)(
@@ -134,18 +134,18 @@ def train_on_samples(
 def controllers_from_classes(
     law: Law, coefficients: Tensor, qd: np.ndarray, qdd: np.ndarray
 ) -> list[MamdaniController]:
-    """A fuzzy controller a joint, with the papers' rules and the shape of their Table 4.
+    """One fuzzy controller per joint, with the papers' rules and sets shaped as in their Table 4.
 
-    The sets lie as in Table 4 (joints 2, 3, 4; more joints take those of joint 2), stretched: of
-    |velocity| to its largest value, of acceleration to its smallest and largest with zero in
-    place, of each coefficient to the span of its classes. The papers' controllers raise a
-    coefficient with the velocity; where ours is smaller for high acceleration than for low, its
-    sets are mirrored. Coefficients of velocity follow the rules of B, all others those of C.
+    The sets are those of Table 4 (joints 2, 3, 4; further joints use those of joint 2), stretched:
+    for |velocity| to its largest value, for acceleration to its smallest and largest value with
+    zero fixed, for each coefficient to the span of its classes. The papers' controllers raise a
+    coefficient with the velocity; if ours is smaller for high acceleration than for low, its sets
+    are mirrored. Viscous coefficients follow the rules of B, all others those of C.
 
     Args:
         law: whose coefficients these are.
         coefficients: low, medium, high, shape (joint, 3, coefficient).
-        qd, qdd: the motion that spans the inputs, (sample, joint).
+        qd, qdd: the motion that defines the input ranges, (sample, joint).
 
     References:
         TLRIP paper, Tables 4 and 5.
@@ -185,7 +185,7 @@ def _variable(name: str, unit: str, terms: Sequence[str], ranges: Ranges) -> Var
 
 
 def _range(term: FuzzySet) -> tuple[float, float]:
-    """The range of Table 4 behind a set, see `sets_from_ranges`."""
+    """The range in Table 4 that corresponds to a set, see `sets_from_ranges`."""
     centre, sigma = term.parameters
     reach = {
         "left_shoulder": (0.0, 2.0),
@@ -196,7 +196,7 @@ def _range(term: FuzzySet) -> tuple[float, float]:
 
 
 def _stretched(variable: Variable, low: float, high: float) -> Ranges:
-    """Ranges of a variable's sets with its universe taken to [low, high] and zero left there."""
+    """Ranges of a variable's sets, with its universe stretched to [low, high] and zero fixed."""
     below, above = variable.universe
     # Velocity enters as a magnitude, so its universe begins at zero.
     down = low / below if below < 0 else 1.0
@@ -215,9 +215,9 @@ def _stretched(variable: Variable, low: float, high: float) -> Ranges:
 def _spanned(
     variable: Variable, classes: Sequence[float], positive: bool
 ) -> tuple[list[str], Ranges]:
-    """Terms and ranges of an output whose universe is spanned by the coefficients by class."""
+    """Terms and ranges of an output whose universe spans the coefficients by class."""
     low, high = min(classes), max(classes)
-    # Equal classes would leave a universe without extent.
+    # With equal classes, the universe would be empty.
     width = max(high - low, NARROWEST * max(abs(low), abs(high)), 1e-9)
     middle = 0.5 * (low + high)
     start = max(0.0, middle - 0.5 * width) if positive else middle - 0.5 * width
@@ -225,7 +225,7 @@ def _spanned(
     shares = [((a - below) / (above - below), (b - below) / (above - below))
               for a, b in map(_range, variable.sets)]  # fmt: skip
     terms = variable.terms
-    # Terms keep their meaning: "high" names the larger coefficient.
+    # Terms keep their meaning: "high" denotes the larger coefficient.
     if classes[-1] < classes[0]:
         shares = [(1.0 - b, 1.0 - a) for a, b in reversed(shares)]
         terms = terms[::-1]

@@ -1,4 +1,4 @@
-"""Stages of a reproduction: fits and their scores, several at a time, kept when finished."""
+"""Stages of a reproduction: fits and their scores, run in parallel and stored when finished."""
 
 import os
 import signal
@@ -49,28 +49,28 @@ from nfriction.simulation.rollout import rollout
 from nfriction.simulation.validate import required_substeps
 
 LAWS = {"NCFM": "viscous", "LFM": "linear", "NLFM": "nonlinear"}
-"""The papers' laws by the name of their constant model."""
+"""The papers' laws, by the names of their constant models."""
 CONSTANT = (*LAWS, "Stribeck")
 ADAPTIVE = tuple(f"A{law}" for law in LAWS)
 BY_PATTERN = tuple(f"{name}-pattern" for name in ADAPTIVE)
-"""Adaptive models by the first paper's pattern search."""
+"""Adaptive models fitted by the first paper's pattern search."""
 NEURO_FUZZY = tuple(f"NF{law}" for law in LAWS)
 PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
 """The second paper's method for each model."""
 EXPERIMENT = "experiment"
-"""Twin of the TLRIP paper's friction experiment, of which its Table 6 gives the classes."""
+"""Twin of the TLRIP paper's friction experiment, whose classes are given in its Table 6."""
 COUNTS = 8192
-"""Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
+"""Counts per revolution of the papers' encoders, four edges for each of 2048 lines."""
 
 
 class Stage(NamedTuple):
     """One step of a reproduction.
 
     Attributes:
-        needs: stages that come before it.
-        run: does it, given the workspace and the stage's name; returns its result, plain JSON.
+        needs: stages that must be finished first.
+        run: runs it, given the workspace and the stage's name; returns its result as plain JSON.
     """
 
     needs: tuple[str, ...]
@@ -78,7 +78,7 @@ class Stage(NamedTuple):
 
 
 def stages() -> dict[str, Stage]:
-    """All stages by name; those that take longest, and what they wait for, come first."""
+    """All stages by name; the longest ones and their prerequisites come first."""
     found = {f"twin-{name}": Stage((), make_twin) for name in twin.names()}
     constant = Stage(("twin-tlrip",), partial(fitted, fit_from_start))
     for law in reversed(LAWS):
@@ -103,17 +103,17 @@ def reproduce(
 ) -> Workspace:
     """Run every stage that is not finished.
 
-    Each stage runs in a worker process and writes its result last, whole or not at all, so a run
-    that was ended by Ctrl-C or by force resumes with what is not finished.
+    Each stage runs in a worker process and writes its result last and atomically, so a run that was
+    interrupted or killed resumes with the unfinished stages.
 
     Args:
-        folder: where all files go; made where it is missing.
-        settings: how thorough. Results made with others are replaced.
-        jobs: stages at a time.
-        progress: show a bar of stages.
+        folder: where all files are written; created if missing.
+        settings: effort. Results from different settings are replaced.
+        jobs: number of stages to run in parallel.
+        progress: show a progress bar of stages.
 
     Returns:
-        The workspace, every stage finished.
+        The workspace, with every stage finished.
 
     Raises:
         ValueError: if `jobs` is not positive.
@@ -147,7 +147,7 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
                 ready.remove(name)
                 running[pool.submit(run_stage, workspace, name)] = name
             bar.set_postfix_str(", ".join(running.values()))
-            # The timeout keeps the bar's clock running.
+            # The timeout keeps the clock of the progress bar running.
             done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
             for future in done:
                 future.result()
@@ -158,14 +158,14 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
 
 
 def _terminate(pool: ProcessPoolExecutor) -> None:
-    # Only an interrupt of the keyboard reaches the workers, and one of them may have been started
-    # just before, so that it is not known to be running yet.
+    # Only a keyboard interrupt reaches the workers, and one may have been started just before, so
+    # that it is not yet known to be running.
     for worker in list((pool._processes or {}).values()):
         worker.terminate()
 
 
 def _end_with_the_caller() -> None:
-    # A solver keeps its best point on Ctrl-C; such a fit would pass for a finished one.
+    # A solver keeps its best point on Ctrl-C; that fit would be mistaken for a finished one.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     caller = parent_process()
     assert caller is not None
@@ -174,13 +174,13 @@ def _end_with_the_caller() -> None:
         caller.join()
         os._exit(1)
 
-    # A caller that is killed cannot end its workers, which would wait for work for ever.
+    # A caller that is killed cannot end its workers, which would wait for work forever.
     threading.Thread(target=watch, daemon=True).start()
 
 
 def run_stage(workspace: Workspace, name: str) -> None:
-    """Run a stage whose needs are finished, and mark it as finished."""
-    # Several threads make small tensors up to 100 times slower.
+    """Run a stage whose prerequisites are finished, and mark it as finished."""
+    # Multithreading makes operations on small tensors up to 100 times slower.
     torch.set_num_threads(1)
     start = time.perf_counter()
     result = stages()[name].run(workspace, name)
@@ -215,7 +215,7 @@ def fit_from_start(
     start: FitResult | None = None,
     **options: Any,
 ) -> FitResult:
-    """A model made with these options and fitted to trajectories, from an earlier fit or none."""
+    """A model with these options, fitted to trajectories, from an earlier fit or none."""
     settings = workspace.settings
     model = model_by_name(name)(bench.plant.joints, **options)
     return workspace.fit(name, bench, lambda step: fit(
@@ -232,7 +232,7 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model our way: a network corrects the constant law, on trajectories."""
+    """A neuro-fuzzy model by our method: a network corrects the constant law, on trajectories."""
     start, settings = fit_from_start(workspace, bench, name.removeprefix("NF")), workspace.settings
     return fit_from_start(
         workspace, bench, name, start=start, terms=settings.terms, head_units=settings.head_units
@@ -249,11 +249,11 @@ def fit_searched(
     start: FitResult | None = None,
     threads: int | None = None,
 ) -> FitResult:
-    """A model fitted by a search on the simulated position, resumed where it was interrupted.
+    """A model fitted by a search on the simulated position, resumed after an interruption.
 
     Args:
         workspace, bench: the run and its rig.
-        name: of the stage: a model's, with a prefix or an ending.
+        name: of the stage: a model name with a prefix or suffix.
         method, threads: see `SearchOptions`.
         horizon: length of the simulated windows [s].
         start: fit to start from.
@@ -271,7 +271,7 @@ def fit_searched(
 
 
 def fit_by_pattern(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """An adaptive model the first paper's way, from its constant fit."""
+    """An adaptive model by the first paper's method, from its constant fit."""
     law = name.removeprefix("A").removesuffix("-pattern")
     return fit_searched(
         workspace, bench, name, "pattern", workspace.settings.windows[-1],
@@ -282,7 +282,7 @@ def fit_by_pattern(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 def network_by_controller(
     workspace: Workspace, bench: Bench, law: str, *, progress: bool = False
 ) -> tuple[FrictionModel, dict[str, Any]]:
-    """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
+    """A neuro-fuzzy model by the papers' method, from coefficients by class; and its fit status."""
     settings = workspace.settings
     losses, keep = recorded_losses(bench.plant.joint_names)
     model, fits = papers_neuro_fuzzy(
@@ -306,7 +306,7 @@ def fitted(
     """Result of a fit on the TLRIP twin."""
     bench = workspace.bench("tlrip")
     found = fit(workspace, bench, name)
-    # A load that a network chose as input is that of the bearings.
+    # If a network selected the load as an input, it is that of the bearings.
     bench = replace(bench, plant=found.plant)
     return _judged(workspace, name, bench, found.model, found.to_dict())
 
@@ -355,7 +355,7 @@ def _judged(
     model: FrictionModel,
     ended: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """End of a model's fit, its scores and coefficients, and its classes if it has any."""
+    """Status of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
     found: dict[str, Any] = {
@@ -382,8 +382,8 @@ def _judged(
 def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str, Array]]:
     """Position errors on every recording by name, and simulated positions of the test recordings.
 
-    The coefficients are driven by the simulated motion, which is honest, and also by the measured
-    one, as in the papers; with constant coefficients the two are the same.
+    The coefficients are driven by the simulated motion (a genuine prediction) and also by the
+    measured motion, as in the papers; with constant coefficients both are the same.
     """
     scores: dict[str, Any] = {}
     simulated: dict[str, Array] = {}
@@ -403,7 +403,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
 def driven_by_measurement(bench: Bench, model: FrictionModel, recording: Recording) -> Array:
     """Positions of a free run whose coefficients follow the measured motion, as in the papers.
 
-    Velocity and acceleration are those that a controller has: period counting and filters.
+    Velocity and acceleration are those available to a controller: period counting and filters.
 
     Returns:
         Positions in the recording's convention, (sample, joint).

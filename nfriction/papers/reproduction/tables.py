@@ -1,6 +1,6 @@
-"""The papers' tables: our numbers with the printed ones.
+"""The papers' tables: our numbers together with the printed ones.
 
-The papers' recordings were never published, so the printed numbers, which come from another
+The papers' recordings were never published, so the printed numbers, which are from a different
 machine, cannot be reproduced exactly. Units of the position errors are not printed; radians are
 assumed.
 """
@@ -42,9 +42,9 @@ SECOND_TABLE_4: dict[str, list[float]] = _PRINTED["rtip_table_4"]
 """RTIP paper, Table IV: position RMSE by model and joint."""
 
 NINE = (*LAWS, *ADAPTIVE, *NEURO_FUZZY)
-"""Three laws, constant, adaptive and neuro-fuzzy."""
+"""Three laws, each constant, adaptive and neuro-fuzzy."""
 TLRIP = (*CONSTANT, *ADAPTIVE, *BY_PATTERN, *NEURO_FUZZY, *PAPERS_WAY)
-# The paper's rows are also compared with rows from its own procedure.
+# The paper's rows are also compared with rows from our run of its own procedure.
 _PRINTED_10 = TABLE_10 | {n: TABLE_10[n.partition("-")[0]] for n in (*BY_PATTERN, *PAPERS_WAY)}
 
 
@@ -54,7 +54,7 @@ class Order(NamedTuple):
     Judged by the median error over fresh releases.
 
     Attributes:
-        holds: true without exceptions.
+        holds: true if there are no exceptions.
         broken: exceptions, in words.
         best: the best of the nine by joint; ties in the printed digits are joined by "=".
     """
@@ -84,7 +84,7 @@ def rmse(
     for name in models:
         scores = workspace.found(name)["scores"].values()
         joints = [s[drive]["joints"] for s in scores if s["split"] == split]
-        # A diverged simulation has no number: its error is infinite.
+        # A diverged simulation has no error value; count it as infinite.
         errors = [[np.inf if e is None else e for e in row] for row in joints]
         rows[name] = np.sqrt(np.mean(np.square(errors), axis=0))
     return _table(rows)
@@ -97,14 +97,14 @@ def fresh(workspace: Workspace, models: Sequence[str] = TLRIP) -> pd.DataFrame:
 
 
 def fresh_runs(workspace: Workspace, models: Sequence[str]) -> dict[str, Array]:
-    """Position RMSE of each free run from a fresh release by model [rad], (release, joint)."""
+    """Position RMSE of each free run from a fresh release, by model [rad], (release, joint)."""
     found = {n: np.array(workspace.found(n)["fresh"], dtype=float) for n in models}
-    # A diverged simulation has no number: its error is infinite.
+    # A diverged simulation has no error value; count it as infinite.
     return {n: np.nan_to_num(e, nan=np.inf) for n, e in found.items()}
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
-    """Position RMSE of every model on test releases, with the paper's.
+    """Position RMSE of every model on test releases, with the paper's values.
 
     References:
         TLRIP paper, Table 10.
@@ -165,7 +165,7 @@ def adaptive_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 
 
 def table_11(workspace: Workspace) -> pd.DataFrame:
-    """Error of NFNLFM below that of each other model [%], 11.57 to 94.55 in print.
+    """Error reduction of NFNLFM relative to each other model [%], 11.57 to 94.55 in print.
 
     The printed values follow from the printed Table 10, which has no constant models.
 
@@ -177,7 +177,7 @@ def table_11(workspace: Workspace) -> pd.DataFrame:
 
 
 def steps_saved(workspace: Workspace) -> pd.DataFrame:
-    """Error saved by adaptive and neuro-fuzzy coefficients over simpler ones of the law [%]."""
+    """Error reduction by adaptive and neuro-fuzzy coefficients relative to simpler ones [%]."""
     pairs = [
         pair
         for law, by_class, network in zip(LAWS, ADAPTIVE, NEURO_FUZZY, strict=True)
@@ -194,13 +194,13 @@ def steps_saved(workspace: Workspace) -> pd.DataFrame:
 
 
 def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """Error of the first model of each pair below the second's, from medians [%], by pair."""
+    """Error reduction of the first model of each pair relative to the second, from medians [%]."""
 
     def saved(table: pd.DataFrame) -> pd.DataFrame:
         rows = {
             name: 100.0 * (1.0 - table.loc[better] / table.loc[worse])
             for name, (better, worse) in pairs.items()
-            # The paper's table lacks constant models.
+            # The paper's table does not include constant models.
             if {better, worse} <= set(table.index)
         }
         return pd.DataFrame(rows).T
@@ -209,7 +209,7 @@ def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.Dat
 
 
 def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
-    """Coefficients of a model on the second paper's rig, with the paper's.
+    """Coefficients of a model on the second paper's rig, with the paper's values.
 
     References:
         RTIP paper, Tables I to III.
@@ -219,7 +219,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 
 
 def second_table_4(workspace: Workspace) -> pd.DataFrame:
-    """Position RMSE on the second paper's rig, with the paper's.
+    """Position RMSE on the second paper's rig, with the paper's values.
 
     References:
         RTIP paper, Table IV.
@@ -245,14 +245,14 @@ def _table(rows: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
-    """Two tables side by side; rows that the paper lacks are empty there."""
-    # Rows follow ours: the print has fewer.
+    """Two tables side by side; rows missing in the paper are empty."""
+    # Rows follow ours, since the paper has fewer.
     return pd.concat({"ours": ours, "printed": theirs.reindex(ours.index)}, axis=1)
 
 
 def order(workspace: Workspace) -> Order:
     """Verdict on the papers' order of models on fresh releases, joint by joint."""
-    # In the printed digits, because a rejected network equals its law only up to round-off.
+    # To the printed digits, because a rejected network equals its law only up to round-off.
     table = (1e3 * fresh(workspace, NINE)).map(lambda e: float(f"{e:.4g}"))
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
     broken = [
@@ -263,7 +263,7 @@ def order(workspace: Workspace) -> Order:
         # A diverged simulation always violates the order.
         if not e <= limit or np.isinf(e)
     ]
-    # Models tie if one kept the other's coefficients.
+    # Models tie if one retained the other's coefficients.
     best = {
         joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
         for k, joint in enumerate(JOINTS)
@@ -292,7 +292,7 @@ def _unconverged(workspace: Workspace) -> list[str]:
 
 
 def conclusion(workspace: Workspace) -> str:
-    """Lines for a reader who does not know the papers: claims reproduced or not, and why."""
+    """Text for readers who do not know the papers: which claims were reproduced, and why."""
     error = pd.concat([fresh(workspace), rmse(workspace, SECOND_PAPER)]).mean(axis=1)
 
     def said(names: Sequence[str]) -> str:
@@ -323,7 +323,7 @@ def conclusion(workspace: Workspace) -> str:
         ),
         str(order(workspace)),
         claim(
-            "networks taught by a fuzzy controller, the papers' own way, have smaller errors than "
+            "networks trained on a fuzzy controller, the papers' method, have smaller errors than "
             f"coefficients by class, {said(PAPERS_WAY)}",
             PAPERS_WAY, ADAPTIVE,
         ),
@@ -332,9 +332,9 @@ def conclusion(workspace: Workspace) -> str:
             (five,) * len(simple), simple,
         ),
         f"Why: a curve over speed fails to explain {missed['speed']:.1%} of the true friction "
-        "torque, a surface over speed and acceleration, the inputs of the papers' networks, "
+        "torque, a surface over speed and acceleration (the inputs of the papers' networks) "
         f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
-        f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
+        f"{len(TLRIP) + len(SECOND_PAPER)} fits did not converge.",
     ]  # fmt: skip
     return "\n".join(lines)
 

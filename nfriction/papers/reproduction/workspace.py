@@ -1,4 +1,4 @@
-"""The folder of a run: its settings, its recordings, and what is finished in it."""
+"""The folder of a run: its settings, its recordings and its finished stages."""
 
 import hashlib
 import json
@@ -36,19 +36,19 @@ class Settings:
     """Everything that the results of a run depend on.
 
     Attributes:
-        seed: of the encoders' errors, the controllers' samples and the searches.
-        tlrip_seconds, rtip_seconds: length of each twin's recordings; the papers took 40 and 80.
+        seed: for the encoders' errors, the controllers' samples and the searches.
+        tlrip_seconds, rtip_seconds: duration of each twin's recordings; 40 and 80 in the papers.
         windows: lengths of the fits' windows [s].
-        max_steps: of the fits, at each length.
+        max_steps: of the fits, at each window length.
         terms, head_units: of the neuro-fuzzy models.
         network_units: of the papers' network.
-        controller_samples: a joint, on which the papers' network learns.
+        controller_samples: per joint, for training the papers' network.
         search_horizon: length of the windows that a search simulates [s].
-        search_evaluations: most simulations of a search on the position error.
+        search_evaluations: limit on simulations of a search on the position error.
         control_models: fitted to the driven rig, for friction compensation.
-        control_seconds: length of each balanced motion [s].
-        fit_plant: adjust inertia and gravity terms, too.
-        origin: of the recordings, and further options, of a run on other data than the twins.
+        control_seconds: duration of each balanced motion [s].
+        fit_plant: also adjust inertia and gravity terms.
+        origin: origin of the recordings and further options of a run on data other than twins.
     """
 
     seed: int = 0
@@ -69,18 +69,18 @@ class Settings:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        # JSON knows no tuples: what is read back would differ.
+        # JSON has no tuples, so settings read back would differ.
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def digest(self) -> str:
-        """Marks a result as made with these settings by this version."""
+        """Digest that identifies results from these settings and this version."""
         # Another version may compute other numbers, so its results are not reused.
         content = json.dumps(self.to_dict() | {"version": __version__}, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
 FULL = Settings()
-"""As the papers: recordings of 40 and 80 s, searched in one run."""
+"""As in the papers: recordings of 40 and 80 s, searched in one run."""
 
 QUICK = Settings(
     tlrip_seconds=10.0,
@@ -94,7 +94,7 @@ QUICK = Settings(
     control_models=("NCFM", "LFM", "NLFM"),
     control_seconds=4.0,
 )
-"""A look at everything within minutes; the numbers are then not those of whole recordings."""
+"""A quick run of everything within minutes; numbers differ from those of whole recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +103,9 @@ class Bench:
 
     Attributes:
         plant: the rig.
-        train, test: recordings to fit on and to judge by.
+        train, test: recordings for fitting and for testing.
         motions: smoothed motion of each, training first, in joint coordinates.
-        states: exact q0 and qd0 by recording, where known.
+        states: exact q0 and qd0 by recording, if known.
     """
 
     plant: Plant
@@ -136,10 +136,10 @@ def smoothed(plant: Plant, recordings: Sequence[Recording]) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Workspace:
-    """The files of a run and the settings that they are made with.
+    """The files of a run and the settings that produced them.
 
-    A stage is finished where its file bears these settings; that file is the last one that the
-    stage writes, so a stage that was killed counts as not begun. `progress` shows a bar a fit.
+    A stage is finished if its file has these settings; that file is the last one that the stage
+    writes, so a stage that was killed counts as not started. `progress` shows a bar for each fit.
     """
 
     folder: Path
@@ -147,10 +147,10 @@ class Workspace:
     progress: bool = False
 
     def result(self, stage: str) -> Any:
-        """Result of a finished stage; None where it is not finished with these settings."""
+        """Result of a finished stage; None if it is not finished with these settings."""
         try:
             content = json.loads(self._file(stage, "json").read_text(encoding="utf-8"))
-        # A damaged file is made again like a missing one.
+        # A damaged file is created again like a missing one.
         except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
             return None
         if not isinstance(content, dict) or content.get("settings") != self.settings.digest():
@@ -158,25 +158,25 @@ class Workspace:
         return content["result"]
 
     def begun(self, stage: str) -> bool:
-        """True if a stage has a result, possibly of other settings."""
+        """True if a stage has a result, possibly from other settings."""
         return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
-        """Result of a stage; a `ValueError` where it is not finished."""
+        """Result of a stage; raises `ValueError` if it is not finished."""
         result: dict[str, Any] | None = self.result(stage)
         if result is None:
             raise ValueError(f"{self.folder}: the stage {stage!r} is not finished; run it first.")
         return result
 
     def finish(self, stage: str, result: Mapping[str, Any], *, strict: bool = True) -> None:
-        """Mark a stage as finished with its result, plain JSON; finite numbers alone if strict."""
+        """Mark a stage as finished with a plain JSON result; only finite numbers if strict."""
         content = {"stage": stage, "settings": self.settings.digest(), "result": result}
         text = json.dumps(content, indent=1, allow_nan=not strict, default=astuple)
         write_atomically(self._file(stage, "json"), text.encode())
 
     def write_arrays(self, stage: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays beside a stage's result; to be called before `finish`."""
-        # The result of other settings would otherwise pass for that of these arrays.
+        """Store arrays in addition to a stage's result; to be called before `finish`."""
+        # A result from other settings would otherwise be mistaken for that of these arrays.
         self._file(stage, "json").unlink(missing_ok=True)
         with atomic_write(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -191,14 +191,14 @@ class Workspace:
         return self.folder / "models" / f"{stage}.json"
 
     def fit(self, stage: str, bench: Bench, make: Callable[[Callback], FitResult]) -> FitResult:
-        """The fit of a stage: read where it is finished, else made by `make(callback)` and kept.
+        """The fit of a stage: read if finished, otherwise made by `make(callback)` and stored.
 
         Its loss after every step is the result of `<stage>-losses`, by part of the fit.
         """
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
             plain = {field: _tuples(value) for field, value in kept.items()}
-            # Those that JSON has as rows.
+            # Fields that JSON stores as rows.
             for field, kind in (
                 ("intervals", Interval),
                 ("outliers", Outliers),
@@ -213,9 +213,9 @@ class Workspace:
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
 
             def step(about: Any, *at: Any) -> None:
-                # Fits report the name of their stage and a step, searches their state.
+                # Fits report the name of their stage and a step; searches report their state.
                 part, loss = (about, at[0].cost) if at else (about.method, about.value)
-                # JSON knows no infinity.
+                # JSON has no infinity.
                 if np.isfinite(loss):
                     losses.setdefault(part, []).append(float(loss))
                 bar.set_description(f"{stage}, {part}")
@@ -241,7 +241,7 @@ class Workspace:
 
         def keep(state: SearchState) -> None:
             step(state)
-            # SQP has no state that would continue it exactly, and JSON no infinity.
+            # SQP has no state from which it resumes exactly, and JSON has no infinity.
             if state.method == "pattern" and np.isfinite(state.value):
                 self.finish(f"{stage}-search", asdict(state))
 
@@ -260,7 +260,7 @@ class Workspace:
             Motion(r.time, kept[f"{r.name}_q"], kept[f"{r.name}_qd"], kept[f"{r.name}_qdd"])
             for r in (*parts["train"], *parts["test"])
         ]
-        # Exact only for twins; other recordings have none.
+        # Only twins have exact initial states.
         states = read_initial_states(folder / "recordings.csv")
         return Bench(plant, parts["train"], parts["test"], motions, states)
 
@@ -268,7 +268,7 @@ class Workspace:
         return self.folder / "stages" / f"{stage}.{suffix}"
 
 
-# Fields of a fit that are kept apart, with the twin, or not at all; the others are plain JSON.
+# Fields of a fit that are stored separately, with the twin, or not at all; others are plain JSON.
 _APART = ("model", "plant", "motions", "uncertainty", "residuals")
 
 

@@ -1,4 +1,4 @@
-"""Twins: simulated recordings of the papers' rigs, whose own were never published."""
+"""Twins: simulated recordings of the papers' rigs, as the real ones were never published."""
 
 from nfriction.papers.twin.dataset import QUICK_DURATION, Twin, build, make, names
 from nfriction.papers.twin.family import TRUTHS, draw, held_out

@@ -1,6 +1,6 @@
 """Recordings of simulated rigs whose friction no model here can express exactly.
 
-Rigs, hidden friction and releases are data here; the cards in `datasets/` say why these.
+Rigs, hidden friction and releases are defined here; the cards in `datasets/` explain the choices.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from nfriction.recording.angles import AngleConvention
 Array = NDArray[np.float64]
 
 Split = Literal["train", "test"]
-RATE = 1000  # samples a second
-JITTER = 5e-6  # standard deviation of the moment of sampling [s]
-QUICK_DURATION = 10.0  # of recordings for a quick look [s]
-# Released exactly upright, a pendulum never falls; a hand leaves it about this far off [deg].
+RATE = 1000  # samples per second
+JITTER = 5e-6  # standard deviation of the sampling instants [s]
+QUICK_DURATION = 10.0  # of recordings for a quick test [s]
+# Released exactly upright, a pendulum never falls; a hand releases it about this far off [deg].
 RELEASE_ERROR = 0.1
 
 
@@ -39,10 +39,10 @@ class Release:
     """The start of one recording.
 
     Attributes:
-        label: names the recording and its file.
-        split: to fit on, or to judge by.
+        label: name of the recording and its file.
+        split: for fitting or for testing.
         degrees: joint angles in the rig's own convention [deg].
-        qd: joint rates [rad/s].
+        qd: joint velocities [rad/s].
     """
 
     label: str
@@ -62,8 +62,8 @@ class Specification:
     """A rig, its hidden friction and its recordings.
 
     Attributes:
-        rig: makes the plant.
-        friction: the truth.
+        rig: creates the plant.
+        friction: the true friction.
         duration: of each recording [s].
         releases: in the order in which they are recorded.
     """
@@ -74,7 +74,7 @@ class Specification:
     releases: tuple[Release, ...]
 
 
-# Plain bushings on pins of 16, 12 and 10 mm, coefficient of friction 0.1, a lip seal each.
+# Plain bushings on pins of 16, 12 and 10 mm, friction coefficient 0.1, each with a lip seal.
 _TLRIP = Specification(
     rig=rigs.tlrip,
     friction=HiddenFriction(
@@ -96,7 +96,7 @@ _TLRIP = Specification(
     ),
 )
 
-# Ball bearings in the first two joints, a bushing in the last, less grease.
+# Ball bearings in the first two joints, a bushing in the last, and less grease.
 _RTIP = Specification(
     rig=rigs.rtip,
     friction=HiddenFriction(
@@ -118,7 +118,7 @@ _RTIP = Specification(
     ),
 )
 
-# The TLRIP paper's friction experiment from (180°, 0, 0), counted from hanging: released upright.
+# The TLRIP paper's friction experiment from (180°, 0, 0), measured from hanging: released upright.
 _EXPERIMENT = replace(_TLRIP, releases=(Release("experiment", "train", (RELEASE_ERROR, 0.0, 0.0)),))
 
 SPECIFICATIONS = {"tlrip": _TLRIP, "rtip": _RTIP, "experiment": _EXPERIMENT}
@@ -133,7 +133,7 @@ def specification(name: str) -> Specification:
     """A twin's specification by its name.
 
     Raises:
-        ValueError: for a name that is none of `names()`.
+        ValueError: for a name that is not in `names()`.
     """
     if name not in SPECIFICATIONS:
         raise ValueError(f"no twin {name!r}; there are {', '.join(SPECIFICATIONS)}.")
@@ -142,10 +142,10 @@ def specification(name: str) -> Specification:
 
 @dataclass(frozen=True)
 class Encoder:
-    """An incremental encoder whose four edges to a line are counted.
+    """An incremental encoder; all four edges per line are counted.
 
     Attributes:
-        lines: to a revolution.
+        lines: per revolution.
         eccentricity: amplitude of the error that repeats every revolution [counts].
         phase: angle at which that error crosses zero [rad].
         edges: displacement of each of the four edges of a line [counts], within ± 0.5.
@@ -163,15 +163,15 @@ class Encoder:
 
     @classmethod
     def drawn(cls, random: np.random.Generator) -> Encoder:
-        """An encoder of usual quality: eccentric by 0.3 counts, edges off by 0.05 counts (rms)."""
+        """An encoder of typical quality: eccentricity 0.3 counts, edge errors 0.05 counts RMS."""
         phase = float(random.uniform(0.0, math.tau))
         first, second, third, fourth = (0.05 * random.standard_normal(4)).tolist()
         return cls(eccentricity=0.3, phase=phase, edges=(first, second, third, fourth))
 
     def read(self, q: Array) -> Array:
-        """Positions [rad] that the counter reads at true positions, any shape."""
+        """Positions [rad] read by the counter at true positions of any shape."""
         place = q / self.quantum + self.eccentricity * np.sin(q - self.phase)
-        # The nearest count; displaced edges then move a position near one to its neighbour.
+        # The nearest count; displaced edges then shift positions near an edge to the next count.
         count = np.floor(place + 0.5)
         # The edge below a count lies half a count down, displaced.
         edges = np.array(self.edges)
@@ -182,15 +182,15 @@ class Encoder:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """Recordings of a rig that does not exist, and the truth behind them.
+    """Recordings of a simulated rig, and the truth behind them.
 
     Attributes:
         name: of the twin.
         plant: the rig without friction.
         recordings: by label, in the rig's own convention.
-        splits: by label: to fit on ("train") or to judge by ("test").
-        initial_states: by label: q0 and qd0 at the release, exact, in the rig's own convention.
-        truth: by label: the motion before the encoder, in joint coordinates. Never to fit on.
+        splits: by label: for fitting ("train") or for testing ("test").
+        initial_states: by label: exact q0 and qd0 at the release, in the rig's own convention.
+        truth: by label: the motion before the encoder, in joint coordinates. Never fit to it.
     """
 
     name: str
@@ -212,8 +212,8 @@ def make(
 
     Args:
         name: "tlrip", "rtip" or "experiment".
-        seed: of the encoders' errors and the clock's jitter; the motion itself is deterministic.
-        duration: of each recording [s]; by default the experiment's own. A shorter twin is the
+        seed: for the encoders' errors and the clock's jitter; the motion itself is deterministic.
+        duration: of each recording [s]; by default that of the experiment. A shorter twin is the
             beginning of a longer one.
         progress: show a progress bar.
 
@@ -224,7 +224,7 @@ def make(
     duration = specified.duration if duration is None else duration
     samples = sample_count(duration)
     plant = specified.rig()
-    # The twin's own mechanics take only the rig's numbers.
+    # The twin's own mechanics use only the numbers of the rig.
     links = Links.of(plant)
     convention = AngleConvention.of(plant)
     truth = {}
@@ -244,7 +244,7 @@ def make(
 
 
 def sample_count(duration: float) -> int:
-    """Samples in a recording of `duration` [s]; refuses one that is too short."""
+    """Number of samples in a recording of `duration` [s]; raises if that is too short."""
     samples = round(duration * RATE)
     if samples < MINIMUM_SAMPLES:
         raise ValueError(
@@ -261,7 +261,7 @@ def record(
     truth: dict[str, TrueMotion],
     seed: int,
 ) -> Twin:
-    """A twin of true motions, read by encoders and a clock whose errors the seed draws."""
+    """A twin from true motions, as measured by encoders and a clock with seeded random errors."""
     random = np.random.default_rng([seed, 0])
     # The same encoders in all recordings, as on a real rig.
     encoders = [Encoder.drawn(random) for _ in plant.joint_names]
@@ -270,7 +270,7 @@ def record(
         # A stream for each release: a shorter twin is the beginning of a longer one.
         random = np.random.default_rng([seed, index + 1])
         late = JITTER * np.clip(random.standard_normal(len(motion.q)), -3.0, 3.0)
-        # The release is the origin of time, and its state is given as exact.
+        # The release is the origin of time, and its state is known exactly.
         late[0] = 0.0
         recordings[label] = _read(motion, encoders, late, plant, label)
     return Twin(
@@ -293,12 +293,12 @@ def build(
 ) -> Twin:
     """Simulate a twin's recordings and write them to a folder.
 
-    The folder then holds `<label>.csv.gz` for every recording, `recordings.csv` (splits, initial
+    The folder then contains `<label>.csv.gz` for every recording, `recordings.csv` (splits, initial
     states, digests), `rig.json` and `truth.npz`. Equal arguments give equal bytes.
 
     Args:
         name, seed, duration, progress: as for `make`.
-        out: the folder; made where it is missing, files of these names are replaced.
+        out: the folder; created if missing; files with these names are replaced.
     """
     twin = make(name, seed=seed, duration=duration, progress=progress)
     write(twin, Path(out))
@@ -330,20 +330,20 @@ def write(twin: Twin, folder: Path) -> None:
         for label, motion in twin.truth.items()
         for key in ("q", "qd", "qdd", "tau_f")
     }
-    # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
+    # Not compressed: floats hardly shrink, and compressing them would take longest of all.
     with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
     write_table(pd.DataFrame(rows), folder / "recordings.csv")
 
 
 def read(name: str, folder: Path) -> Twin:
-    """A twin from the folder that `build` wrote it to.
+    """A twin from the folder to which `build` wrote it.
 
     Raises:
         OSError: if a file is missing.
     """
     plant = rigs.read(folder / "rig.json")
-    assert isinstance(plant, PendulumChain)  # `write` takes no other
+    assert isinstance(plant, PendulumChain)  # `write` accepts no other
     overview = pd.read_csv(folder / "recordings.csv", dtype={"id": str, "file": str})
     with np.load(folder / "truth.npz", allow_pickle=False) as kept:
         truth = {
@@ -366,10 +366,10 @@ def read(name: str, folder: Path) -> Twin:
 def _read(
     motion: TrueMotion, encoders: list[Encoder], late: Array, plant: PendulumChain, label: str
 ) -> Recording:
-    """A motion as the rig's computer logs it, on an even clock, each sample `late` [s]."""
+    """A motion as logged by the rig's computer: evenly spaced stamps, samples `late` by [s]."""
     convention = AngleConvention.of(plant)
     late = late[:, None]
-    # Jitter is far below a sample: two terms of the series err far less than a count.
+    # Jitter is far below a sample time, so second-order Taylor errors are far below a count.
     moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)
     position = convention.position_from_joint(moved)
     return Recording(

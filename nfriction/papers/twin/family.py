@@ -1,18 +1,18 @@
-"""A family of twins to judge methods by: releases, friction and its parameters drawn by a seed.
+"""A family of twins for testing methods: a seed draws releases, friction and its parameters.
 
-The friction torque of a joint is, with the effects that its truth names and no other,
+The friction torque of a joint, with only the effects that its truth names, is
 
     tau_f = w D s + w B v / (1 + |v / v_t|^m)
     D = F (1 - a + a |R| / R_0) (1 + r cos(k q + p)) (1 + b exp(-(u / v_s)^2))
     s = tanh(v / v_smooth),  w = (1 + d s) exp(-h),  h' = P / C - h / T,  u' = (v - u) / T_u
 
-with the force |R| that the bearing carries over its value R_0 at rest, heat h from the power P
-that friction turns into heat, and the velocity u of a moment ago, to first order v - T_u dv/dt.
-Bristles of stiffness K = F / x replace w D s by K z with z' = v - |v| K z / max(w D, F / 4) (Dahl).
-All of it is passive: D, B and w are positive, and bristles return at most what is stored in them.
+with the bearing force |R| relative to its value R_0 at rest, heat h from the power P that friction
+dissipates, and the lagging velocity u, which to first order is v - T_u dv/dt. Bristles of stiffness
+K = F / x replace w D s by K z with z' = v - |v| K z / max(w D, F / 4) (Dahl). The friction is
+passive: D, B and w are positive, and bristles return at most the energy stored in them.
 
-Mechanics, friction and integrator are this file's own. No law or input of the library may be built
-from these formulas: the family is there to judge by, and knows other classes than the library.
+Mechanics, friction and integrator are independent of the library. No law or input of the library
+may be built from these formulas: the family is for testing, with model classes of its own.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from nfriction.plant import rigs
 Array = NDArray[np.float64]
 
 DURATION = 20.0  # of a release [s]
-HELD_OUT = 10  # releases to judge by
+HELD_OUT = 10  # test releases
 COUNT = Encoder().quantum  # [rad]
-# Largest error [counts] that a release off by a count at every joint may grow to: beyond it a free
-# run would measure the error of its start rather than that of the friction model.
+# Largest error [counts] to which an error of one count at every joint of a release may grow: beyond
+# it a free run would measure the error of its start rather than that of the friction model.
 PREDICTABLE = 16
-CANDIDATES = 20  # releases tried at a time
-# Streams of random numbers beyond those of the encoders, which number the recordings.
+CANDIDATES = 20  # releases simulated at a time
+# Random number streams, beyond those of the encoders, which are numbered by recording.
 OF_FRICTION, OF_RELEASES = 2**16, 2**16 + 1
 # Velocity over which the sign of dry friction changes, for the integrator's sake [rad/s].
 V_SMOOTH = 0.01
@@ -52,11 +52,11 @@ class Parameter(NamedTuple):
     """A parameter of the friction, drawn uniformly for every joint.
 
     Attributes:
-        effect: the truth that it belongs to; empty where every truth has it.
-        low, high: smallest and largest value, of all joints or of each.
-        absent: the value where the truth lacks the effect.
+        effect: the truth to which it belongs; empty if every truth has it.
+        low, high: smallest and largest value, for all joints or for each.
+        absent: the value if the truth lacks the effect.
         meaning: symbol, unit and name.
-        signed: either sign is as likely.
+        signed: both signs are equally likely.
     """
 
     effect: str
@@ -70,23 +70,23 @@ class Parameter(NamedTuple):
 PARAMETERS = {
     "dry": Parameter("", (0.03, 0.02, 0.01), (0.06, 0.04, 0.02), 0.0, "F [N m], dry friction"),
     "viscous": Parameter("", (0.03, 0.02, 0.015), (0.06, 0.04, 0.03), 0.0, "B [N m s/rad]"),
-    "share": Parameter("load", 0.5, 1.0, 0.0, "a, share of dry friction that follows the load"),
-    "lean": Parameter("direction", 0.1, 0.3, 0.0, "d, of the direction of turning", signed=True),
-    "thin_from": Parameter("shear", 1.0, 4.0, np.inf, "v_t [rad/s], where B has fallen to half"),
+    "share": Parameter("load", 0.5, 1.0, 0.0, "a, load-dependent share of dry friction"),
+    "lean": Parameter("direction", 0.1, 0.3, 0.0, "d, asymmetry with direction", signed=True),
+    "thin_from": Parameter("shear", 1.0, 4.0, np.inf, "v_t [rad/s], at which B is halved"),
     "thinning": Parameter("shear", 0.7, 1.3, 1.0, "m, exponent of Cross's law"),
-    "capacity": Parameter("warming", 2.0, 5.0, np.inf, "C [J], heat that lowers friction e times"),
-    "cooling": Parameter("warming", 5.0, 20.0, 1.0, "T [s], of cooling"),
-    "slip": Parameter("bristle", 0.03, 0.08, 0.0, "x [rad], bend at which bristles slip"),
-    "ripple": Parameter("ripple", 0.2, 0.5, 0.0, "r, of the position"),
-    "waves": Parameter("ripple", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0, "k, waves in a turn"),
+    "capacity": Parameter("warming", 2.0, 5.0, np.inf, "C [J], heat that divides friction by e"),
+    "cooling": Parameter("warming", 5.0, 20.0, 1.0, "T [s], time constant of cooling"),
+    "slip": Parameter("bristle", 0.03, 0.08, 0.0, "x [rad], deflection at which bristles slip"),
+    "ripple": Parameter("ripple", 0.2, 0.5, 0.0, "r, amplitude over the position"),
+    "waves": Parameter("ripple", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0, "k, waves per revolution"),
     "phase": Parameter("ripple", 0.0, 2 * np.pi, 0.0, "p [rad]"),
-    "rise": Parameter("lag", 0.5, 1.0, 0.0, "b, dry friction at rest over that in motion, less 1"),
+    "rise": Parameter("lag", 0.5, 1.0, 0.0, "b, dry friction at rest over that in motion, minus 1"),
     "film": Parameter("lag", 0.5, 1.5, 1.0, "v_s [rad/s], over which a film builds up"),
-    "lag": Parameter("lag", 0.02, 0.06, 1.0, "T_u [s], by which the film follows the velocity"),
+    "lag": Parameter("lag", 0.02, 0.06, 1.0, "T_u [s], lag of the film behind the velocity"),
 }
 TRUTHS = tuple(dict.fromkeys(p.effect for p in PARAMETERS.values() if p.effect))
 PLAIN = "plain"
-"""The truth without any effect: dry and viscous friction alone."""
+"""The truth without any effect: only dry and viscous friction."""
 
 
 def effects_of(truth: str) -> tuple[str, ...]:
@@ -113,7 +113,7 @@ def parameters(truth: str, seed: int) -> dict[str, Array]:
     random = np.random.default_rng([seed, OF_FRICTION])
     drawn = {}
     for name, p in PARAMETERS.items():
-        # Drawn even where it is not used, so that the next ones do not depend on the truth.
+        # Drawn even if not used, so that later values do not depend on the truth.
         value = np.array(p.low) + np.subtract(p.high, p.low) * random.random(3)
         sign = random.choice([-1.0, 1.0], 3)
         if p.effect and p.effect not in effects:
@@ -123,14 +123,14 @@ def parameters(truth: str, seed: int) -> dict[str, Array]:
 
 
 def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: bool = False) -> Twin:
-    """Simulate a rig of the family: two releases to train on and ten to judge by.
+    """Simulate a rig of the family: two training releases and ten test releases.
 
     The plant is `twin.plant`, the recordings are `twin.part("train")` and `twin.part("test")`.
-    Releases start at rest; of those to judge by only predictable ones are taken, by the truth.
+    Releases start at rest; for testing, only those with a predictable true motion are used.
 
     Args:
-        truth: of `TRUTHS`, or several with + between them, or "plain".
-        seed: of releases, parameters, encoders and jitter.
+        truth: one of `TRUTHS`, or several joined by +, or "plain".
+        seed: for releases, parameters, encoders and jitter.
         duration: of each recording [s].
         progress: show a progress bar.
 
@@ -147,7 +147,7 @@ def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: boo
         poses = [_pose(random, upright=k % 2 == 0) for k in range(CANDIDATES)]
         found, growth = motion.simulate(poses, samples, progress=progress)
         if not chosen:
-            growth[:2] = 0.0  # windows to train on are too short for their start to matter
+            growth[:2] = 0.0  # training windows are too short for errors of their start to matter
         chosen += [(poses[k], found[k]) for k in np.flatnonzero(growth <= PREDICTABLE * COUNT)]
     del chosen[2 + HELD_OUT :]
     releases = [Release(f"test_{k - 1}", "test", pose) for k, (pose, _) in enumerate(chosen)]
@@ -164,7 +164,7 @@ def build(
     duration: float = DURATION,
     progress: bool = False,
 ) -> Twin:
-    """Draw a twin and write it to a folder: files as of `twin.build`, and the card `README.md`."""
+    """Draw a twin and write it to a folder: the files of `twin.build`, and the card `README.md`."""
     twin = draw(truth, seed=seed, duration=duration, progress=progress)
     write(twin, Path(out))
     command = f"nfriction twin --truth {truth} --seed {seed} --seconds {duration:g}"
@@ -176,8 +176,8 @@ def build(
 def held_out(comparison: Comparison) -> pd.DataFrame:
     """Free-run errors over the test recordings by model: median and pooled, by joint [rad].
 
-    Pooled errors are the root mean square over recordings, as in `Comparison.table`, which one
-    recording may dominate; the median does not.
+    Pooled errors are the root mean square over recordings, as in `Comparison.table`; one recording
+    may dominate them, unlike the median.
     """
     columns = [*comparison.joint_names, "all"]
     median = {
@@ -189,7 +189,7 @@ def held_out(comparison: Comparison) -> pd.DataFrame:
 
 
 def _pose(random: np.random.Generator, upright: bool) -> Vector:
-    """Joint angles [deg] of a release, to a tenth as a person would set them."""
+    """Joint angles [deg] of a release, rounded to 0.1 as a person would set them."""
     tilt, second, third = random.uniform([20.0, -60.0, -60.0], [90.0, 60.0, 60.0])
     first = random.choice([-1.0, 1.0]) * tilt + (0.0 if upright else 180.0)
     return round(first, 1), round(second, 1), round(third, 1)
@@ -198,15 +198,15 @@ def _pose(random: np.random.Generator, upright: bool) -> Vector:
 class _Motion:
     """Motion of many releases at once, each a column of arrays (joint, release).
 
-    The state is (5, joint, release): absolute angles and rates, bend of the bristles, heat and the
-    lagging velocity of every joint.
+    The state is (5, joint, release): absolute angles and velocities, deflection of the bristles,
+    heat and lagging velocity of every joint.
     """
 
     def __init__(self, links: Links, friction: Mapping[str, Array]) -> None:
         a22, a33, a44, a23, a24, a34 = links.coupling
         self.coupling = np.array([[a22, a23, a24], [a23, a33, a34], [a24, a34, a44]])[..., None]
         self.mass, self.com = np.array(links.mass)[:, None], np.array(links.com)[:, None]
-        # The last link carries no hinge.
+        # No hinge follows the last link.
         self.length = np.array([*links.length[:-1], 0.0])[:, None]
         self.moment, self.gravity = np.array(links.moment)[:, None], links.gravity
         self.at_rest = self.gravity * np.cumsum(self.mass[::-1], axis=0)[::-1]
@@ -216,7 +216,7 @@ class _Motion:
         """Derivative of the state, and friction torques (joint, release)."""
         angle, rate, bend, heat, lagging = state
         of = self.friction
-        # Upright is the real axis: products give cosines and sines of differences of angles.
+        # Upright is the real axis: products give cosines and sines of angle differences.
         along = np.exp(1j * angle)
         between = self.coupling * (along[:, None] * along.conj())
         force = self.moment * along.imag - (between.imag * (rate * rate)).sum(axis=1)
@@ -229,15 +229,15 @@ class _Motion:
         fluid = scale * of["viscous"] * v / (1.0 + np.abs(v / of["thin_from"]) ** of["thinning"])
 
         def drag_of(level: Array) -> tuple[Array, Array]:
-            """Torque of dry friction, and the rate at which bristles bend."""
+            """Torque of dry friction, and the deflection rate of the bristles."""
             if not of["slip"].any():
                 return level * sign, np.zeros_like(v)
             torque = of["dry"] / of["slip"] * bend
-            # Without the bound, bristles under no load would follow faster than the steps do.
+            # Without the bound, unloaded bristles would be too fast for the integration steps.
             return torque, v - np.abs(v) * torque / np.maximum(level, of["dry"] / 4)
 
         def accelerations(drag: Array) -> Array:
-            # A joint's torque acts on two links.
+            # The torque of a joint acts on two links.
             torque = drag + fluid
             torque[:-1] -= torque[1:]
             return np.linalg.solve(between.real.T, (force - torque).T[..., None])[..., 0].T
@@ -245,20 +245,20 @@ class _Motion:
         drag, bending = drag_of(dry)
         acceleration = accelerations(drag)
         if of["share"].any():
-            # The load depends on the acceleration, which depends on it so little (some hundredths)
+            # The load depends on the acceleration, which depends on it so little (a few percent)
             # that a third repetition would change friction by less than a thousandth.
             for _ in range(2):
                 load = self.reaction(along, rate, acceleration) / self.at_rest
                 drag, bending = drag_of(dry * (1.0 + of["share"] * (load - 1.0)))
                 acceleration = accelerations(drag)
-        # Power into heat: all but the part that bends bristles.
+        # Dissipated power: all except the part that deflects the bristles.
         power = drag * (v - bending) + fluid * v
         warming = power / of["capacity"] - heat / of["cooling"]
         change = [rate, acceleration, bending, warming, (v - lagging) / of["lag"]]
         return np.stack(change), drag + fluid
 
     def reaction(self, along: NDArray[np.complex128], rate: Array, acceleration: Array) -> Array:
-        """Force that each joint's bearing carries [N], of all links beyond it."""
+        """Force carried by each joint's bearing [N], from all links beyond it."""
         turn = (1j * acceleration - rate * rate) * along
         beyond = np.cumsum(self.length * turn, axis=0)
         hinge = np.concatenate([np.zeros_like(beyond[:1]), beyond[:-1]])
@@ -273,9 +273,9 @@ class _Motion:
         step: float = 1.0 / RATE,
         progress: bool = False,
     ) -> tuple[list[TrueMotion], Array]:
-        """Motions of releases at rest, and the largest growth of an error of a count [rad].
+        """Motions of releases at rest, and the largest growth of a one-count error [rad].
 
-        Every release is simulated twice, once with every joint a count off.
+        Every release is simulated twice, once with every joint off by one count.
         """
         count = len(poses)
         off = COUNT * np.array([1.0, -1.0, 1.0])[:, None]
@@ -290,12 +290,12 @@ class _Motion:
             now = (q, _joint(state[1]), _joint(change[1]), torque)
             kept[sample] = [part[:, :count] for part in now]
             state = self._step(state, change, step)
-        # Releases first, each with its samples together.
+        # Releases first, with the samples of each contiguous.
         parts = np.ascontiguousarray(kept.transpose(3, 1, 0, 2))
         return [TrueMotion(*of) for of in parts], growth
 
     def _step(self, state: Array, first: Array, step: float) -> Array:
-        """One classical Runge-Kutta step, the derivative at its start already known."""
+        """One classical Runge-Kutta step, given the derivative at its start."""
         second, _ = self.rates(state + 0.5 * step * first)
         third, _ = self.rates(state + 0.5 * step * second)
         fourth, _ = self.rates(state + step * third)
@@ -303,7 +303,7 @@ class _Motion:
 
 
 def _joint(absolute: Array) -> Array:
-    """Joint angles or rates of absolute ones."""
+    """Joint angles or velocities from absolute ones."""
     return np.concatenate([absolute[:1], absolute[1:] - absolute[:-1]])
 
 
@@ -330,11 +330,11 @@ Friction: {" and ".join(effects) or "dry and viscous"}; the equations are in
 |---|---|---|
 {rows}
 
-Encoders of 2048 lines, four counts each; files as in the card of `tlrip_twin`. Releases at rest:
+Encoders with 2048 lines, four counts each; files as in the card of `tlrip_twin`. Releases at rest:
 
 | id | angles [deg] |
 |---|---|
 {starts}
 
-A count at every joint of a test release grows to at most {PREDICTABLE} counts.
+An error of one count at every joint of a test release grows to at most {PREDICTABLE} counts.
 """

@@ -1,18 +1,18 @@
 """Mechanics of the twins in plain floats: three hinged links, their friction, an integrator.
 
-Independent of `nfriction.plant` and `nfriction.simulation` on purpose, so that a fault in those
-does not hide in the recordings that judge them; they share only the rig's numbers. Angles are
-absolute, from upright, inside this file and joint angles at its border.
+Deliberately independent of `nfriction.plant` and `nfriction.simulation`, so that an error in these
+cannot hide in the recordings that test them; they share only the numbers of the rig. Angles are
+absolute, from upright, inside this file; its interface uses joint angles.
 
 Friction is a law that none of the models can express exactly:
 
     tau_f = S(v) (F_c + r_mu |R|) (1 + d s) s + w(t) B v (1 + (v / v_t)^2)^((n - 1) / 2)
     s = tanh(v / v_smooth),  S(v) = 1 + k exp(-(v / v_s)^2),  w(t) = 1 - p (1 - exp(-t / T))
 
-A lip seal drags with F_c at any load; a bearing with its coefficient of friction times its radius,
-r_mu, times the force |R| that it carries. Both drag k times more before a film of lubricant builds
-up over the Stribeck velocity v_s, and a little more in one direction than the other (d). Grease
-resists with B v, thins with the rate of shear (Carreau's law, exponent n) and with its warming.
+A lip seal drags with F_c at any load; a bearing with its friction coefficient times its radius,
+r_mu, times the force |R| that it carries. Both drag 1 + k times as much at rest, before a film of
+lubricant builds up over the Stribeck velocity v_s, and differ with direction (d). Grease resists
+with B v and thins with the shear rate (Carreau's law, exponent n) and as it warms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Links:
     """Constants of three links on a fixed pivot.
 
     Attributes:
-        mass, com, length: of each link [kg], joint to mass centre and to the next joint [m].
+        mass, com, length: mass of each link [kg], distance to its mass centre and next joint [m].
         coupling: a22, a33, a44, a23, a24, a34 in the paper's numbering [kg m^2].
         gravity, moment: [m/s^2], and g b_i [N m].
     """
@@ -52,7 +52,7 @@ class Links:
     def of(cls, plant: PendulumChain) -> Links:
         """The constants of a rig with three links and a fixed arm."""
         rig = plant.to_dict()
-        # Refused rather than ignored: the recordings would not be of the rig that is written.
+        # Rejected rather than ignored: the recordings would not match the rig that is written.
         if plant.joints != 3 or rig.get("arm") or rig.get("buffers") or rig.get("armature"):
             raise ValueError("a twin has three links on a fixed pivot, without drag or rotors.")
         (m2, m3, m4), (l2, l3, l4), (length2, length3, _) = rig["mass"], rig["com"], rig["length"]
@@ -79,20 +79,20 @@ class Links:
 
 @dataclass(frozen=True)
 class HiddenFriction:
-    """Parameters of the true friction, a value per joint where the joints differ.
+    """Parameters of the true friction, one value per joint where the joints differ.
 
     Attributes:
         seal: F_c, dry drag of the seal [N m].
         bearing_arm: r_mu, coefficient of friction times radius [m].
-        stribeck_rise: k, dry friction at standstill over that in motion, less one [-].
+        stribeck_rise: k, ratio of dry friction at standstill to that in motion, minus one [-].
         stribeck_velocity: v_s [rad/s].
         asymmetry: d, dry friction is (1 + d) times as much for positive velocities [-].
         viscous: B of cold, unsheared grease [N m s/rad].
         shear_velocity: v_t, above which the grease thins [rad/s].
         shear_exponent: n, 1 for a Newtonian fluid [-].
-        warming: p, relative loss of the grease's viscosity in the long run [-].
+        warming: p, long-term relative loss of the grease's viscosity [-].
         warming_time: T [s].
-        v_smooth: velocity over which the sign changes, for the integrator's sake [rad/s].
+        v_smooth: velocity over which the sign changes, for the integrator [rad/s].
     """
 
     seal: Vector
@@ -108,17 +108,17 @@ class HiddenFriction:
     v_smooth: float = 3e-3
 
     def viscosity(self, time: float) -> float:
-        """Viscosity of the grease over that at the start, w(t) [-]."""
+        """Viscosity of the grease relative to its initial value, w(t) [-]."""
         return 1.0 - self.warming * (1.0 - math.exp(-time / self.warming_time))
 
     def joint(self, index: int) -> Callable[[float, float, float], float]:
         """Friction torque of one joint: (v [rad/s], |R| [N], viscosity [-]) -> tau_f [N m]."""
-        # Plain local floats: the integrator calls this some million times.
+        # Plain local floats: the integrator calls this about a million times.
         seal, arm = self.seal[index], self.bearing_arm[index]
         rise, v_s = self.stribeck_rise[index], self.stribeck_velocity[index]
         asymmetry, v_smooth = self.asymmetry[index], self.v_smooth
         viscous, v_t = self.viscous[index], self.shear_velocity[index]
-        # The root of Carreau's law, merged with its exponent.
+        # The square root in Carreau's law, merged with its exponent.
         power = 0.5 * (self.shear_exponent - 1.0)
         tanh, exp = math.tanh, math.exp
 
@@ -149,7 +149,7 @@ class TrueMotion:
 
 
 _State = tuple[float, float, float, float, float, float]
-# (time, absolute angles and rates) -> absolute accelerations, joint friction torques
+# (time, absolute angles and velocities) -> absolute accelerations, joint friction torques
 _Rates = Callable[[float, _State], tuple[Vector, Vector]]
 
 
@@ -163,11 +163,11 @@ def rates_of(links: Links, friction: HiddenFriction | None) -> _Rates:
     def rates(time: float, state: _State) -> tuple[Vector, Vector]:
         p2, p3, p4, w2, w3, w4 = state
         s2, s3, s4, c2, c3, c4 = sin(p2), sin(p3), sin(p4), cos(p2), cos(p3), cos(p4)
-        # M and the centrifugal terms by the addition theorems.
+        # M and the centrifugal terms, by the addition theorems.
         m23, k23 = a23 * (c2 * c3 + s2 * s3), a23 * (s2 * c3 - c2 * s3)
         m24, k24 = a24 * (c2 * c4 + s2 * s4), a24 * (s2 * c4 - c2 * s4)
         m34, k34 = a34 * (c3 * c4 + s3 * s4), a34 * (s3 * c4 - c3 * s4)
-        # M = L D L^T, factored once for the motion without and with friction.
+        # M = L D L^T, factored once for the motions with and without friction.
         l32, l42 = m23 / a22, m24 / a22
         d3, n34 = a33 - l32 * m23, m34 - l32 * m24
         l43 = n34 / d3
@@ -199,8 +199,8 @@ def rates_of(links: Links, friction: HiddenFriction | None) -> _Rates:
 def _drag(links: Links, friction: HiddenFriction) -> Callable[..., Vector]:
     """Friction torques of the joints under the forces that their bearings carry.
 
-    The forces are those of the motion without friction from the same state: friction torques of
-    some hundredths of a newton metre hardly change them, and so there is no implicit equation.
+    The forces are those of frictionless motion from the same state: friction torques of a few
+    hundredths of a newton metre hardly change them, so no implicit equation has to be solved.
     """
     (m2, m3, m4), (l2, l3, l4), (length2, length3, _) = links.mass, links.com, links.length
     gravity = links.gravity
@@ -212,7 +212,7 @@ def _drag(links: Links, friction: HiddenFriction) -> Callable[..., Vector]:
     ) -> Vector:
         (s2, s3, s4), (c2, c3, c4) = sines, cosines
         (w2, w3, w4), (a2, a3, a4) = rates, accelerations
-        # Acceleration, less gravity's, of the hinges and mass centres; x across, y up.
+        # Acceleration minus gravity of the hinges and mass centres; x across, y up.
         x2, y2 = c2 * a2 - s2 * w2 * w2, -s2 * a2 - c2 * w2 * w2
         x3, y3 = c3 * a3 - s3 * w3 * w3, -s3 * a3 - c3 * w3 * w3
         x4, y4 = c4 * a4 - s4 * w4 * w4, -s4 * a4 - c4 * w4 * w4
@@ -248,15 +248,15 @@ def simulate(
     Args:
         links: the mechanism.
         friction: None for none.
-        q0, qd0: joint angles and rates at the release [rad, rad/s].
-        samples: how many, the first at the release.
-        rate: samples a second [1/s].
-        substeps: steps to a sample.
-        advance: called after every second simulated.
+        q0, qd0: joint angles and velocities at the release [rad, rad/s].
+        samples: number of samples; the first is at the release.
+        rate: samples per second [1/s].
+        substeps: integration steps per sample.
+        advance: called after every simulated second.
     """
     rates = rates_of(links, friction)
     step = 1.0 / (rate * substeps)
-    # Absolute angles make the mass matrix a product of constants and cosines of differences.
+    # With absolute angles, entries of the mass matrix are constants times cosines of differences.
     state: _State = (*np.cumsum(q0).tolist(), *np.cumsum(qd0).tolist())
     rows = []
     for sample in range(samples):
@@ -274,8 +274,8 @@ def simulate(
 
 
 def _runge_kutta(rates: _Rates, time: float, state: _State, a: Vector, h: float) -> _State:
-    """One classical step, the accelerations `a` at its start already known."""
-    # Written out: calls on arrays of three cost more than the arithmetic.
+    """One classical step, given the accelerations `a` at its start."""
+    # Written out: NumPy calls on arrays of three cost more than the arithmetic.
     p, q, r, u, v, w = state
     half, sixth = 0.5 * h, h / 6.0
     a1, b1, c1 = a
@@ -296,5 +296,5 @@ def _runge_kutta(rates: _Rates, time: float, state: _State, a: Vector, h: float)
 
 
 def _joint(absolute: Array) -> Array:
-    """Joint coordinates of absolute ones."""
+    """Joint coordinates from absolute ones."""
     return np.diff(absolute, axis=1, prepend=0.0)
