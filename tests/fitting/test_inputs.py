@@ -94,13 +94,18 @@ ONE = torch.ones(6, dtype=torch.float64)
 
 
 class Contest:
-    """A rival whose law leaves these errors; without inputs it leaves 1.0."""
+    """A rival whose law and network leave these errors; without inputs they leave 1.0."""
 
     found = None
 
-    def __init__(self, task, start, of_law=ONE) -> None:
-        self.task, self.start, self.validation, self.of_law = task, start, self, of_law
+    def __init__(self, task, start, of_law=ONE, error=ONE) -> None:
+        self.task, self.start, self.validation = task, start, self
+        self.of_law, self.final = of_law, error
         self.trained = False
+
+    @property
+    def squares(self) -> torch.Tensor:
+        return self.final if self.trained else self.of_law
 
     def train(self) -> None:
         self.trained = True
@@ -113,19 +118,22 @@ def task():
 
 
 @pytest.mark.parametrize(
-    ("of_law", "driving", "wins", "trained"),
+    ("rival", "driving", "wins", "trained"),
     [
-        (0.9 * ONE, False, True, True),
-        (0.9 * ONE, True, False, True),
-        (1.1 * ONE, False, False, False),
-        (torch.linspace(0.2, 1.6, 6), False, False, False),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, False, True, True),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, False, True),
+        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, False, True),
+        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False, False),
+        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False, False),
     ],
 )
-def test_inputs_have_to_win_for_the_law(task, monkeypatch, of_law, driving, wins, trained):
+def test_inputs_have_to_win_for_the_law_and_for_its_network(
+    task, monkeypatch, rival, driving, wins, trained
+):
     gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
 
     def contest(task, start):
-        made.append(Contest(task, start, of_law))
+        made.append(Contest(task, start, **rival))
         return made[-1]
 
     monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)

@@ -43,7 +43,6 @@ from nfriction.fitting.task import (
     regression,
 )
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
@@ -221,7 +220,10 @@ def best_of_starts(
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
     implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
-    embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
+    # Coefficients at which the law equals its nested law.
+    embedded = torch.where(torch.tensor([c.linear for c in law.coefficients]), 0.0, implied)
+    places = [law.names.index(name) for name in law.nested_coefficients]
+    embedded[:, places] = nested.parts.friction.reshape(len(implied), -1)
     loss = own.problem.loss
     best, lowest = own, _misfit(own, noise, loss) if same else math.inf
     limit = _misfit(nested, noise, loss)
@@ -240,17 +242,6 @@ def best_of_starts(
         if found.stopped:
             return best.as_stopped()
     return best
-
-
-def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
-    """Coefficients at which a law equals its nested law, (joint, coefficient).
-
-    Nonlinear coefficients are taken from `shapes`.
-    """
-    linear = torch.tensor([c.linear for c in law.coefficients])
-    embedded = torch.where(linear, 0.0, shapes)
-    embedded[:, [law.names.index(name) for name in law.nested_coefficients]] = nested
-    return embedded
 
 
 def _windows_from(found: HorizonResult) -> Windows:

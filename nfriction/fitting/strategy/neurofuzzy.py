@@ -1,9 +1,9 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First, further inputs (`inputs`) are added to the law if they improve it on hold-out windows. Then
-the network is trained with fixed sets, and hold-out windows select the priors. Training continues
-with the residual noise, with the prior of each group of parameters set by evidence, and moves the
-sets if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
+First, the network is trained with fixed sets, and hold-out windows select the priors. Further
+inputs (`inputs`) are kept if law and network improve on hold-out windows. Training continues with
+the residual noise, with the prior of each group of parameters set by evidence, and moves the sets
+if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
 windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
 """
 
@@ -102,9 +102,9 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     with suppress(StoppedError):
         if widened is None:
             raise StoppedError
+        contest.train()
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
-        contest.train()
     if chosen:
         cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     found = replace(
@@ -119,7 +119,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
-    """Inputs that improve the law on hold-out windows (or none), and the contest with them."""
+    """Inputs that improve law and network on hold-out windows (or none), and their contest."""
     task = plain.task
     chosen = chosen_inputs(task, plain.start)
     names = [gain.name for gain in chosen]
@@ -132,9 +132,12 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    if not gains(rival.validation.of_law, plain.validation.of_law, task.options.input_chance):
+    chance = task.options.input_chance
+    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
         return (), plain
     rival.train()
+    if not gains(rival.squares, plain.squares, chance):
+        return (), plain
     # Friction of the constant law may drive a joint even if that of its network does not.
     return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
@@ -173,6 +176,12 @@ class _Contest:
         return gains(trial.squares, self.validation.of_law)
 
     @property
+    def squares(self) -> Tensor:
+        """Squared errors of the network if it is accepted, else of the law, (window,)."""
+        assert self.best is not None
+        return self.best.squares if self.accepts(self.best) else self.validation.of_law
+
+    @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network if it is accepted."""
         assert self.best is not None
@@ -183,9 +192,8 @@ class _Contest:
         return replace(self.start, model=model, plant=plant)
 
     def train(self) -> None:
-        """Find the best network, unless already done; raises `StoppedError`."""
-        if self.best is None:
-            self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
+        """Find the best network; raises `StoppedError`."""
+        self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
     def result(self, model: FrictionModel) -> FitResult:
         """The fully trained network, or its law, written into a model of the same kind."""
