@@ -236,9 +236,7 @@ _RULES: dict[str, Rule] = {
     "squeeze": lambda g, a, dim: g.emit("Squeeze", a, _integers(*dim)),
     "unsqueeze": lambda g, a, dim: g.emit("Unsqueeze", a, _integers(dim)),
     "cat": lambda g, parts, dim=0: g.emit("Concat", *parts, axis=dim),
-    "constant_pad_nd": lambda g, a, pads, value=0.0: g.emit(
-        "Pad", a, _integers(*pads), value, _integers(-1)
-    ),
+    "constant_pad_nd": lambda g, a, n, x=0.0: g.emit("Pad", a, _integers(*n), x, _integers(-1)),
     "view": _view,
     "permute": lambda g, a, dims: g.emit("Transpose", a, perm=list(dims)),
     "_softmax": lambda g, a, dim, *_: g.emit("Softmax", a, axis=dim),

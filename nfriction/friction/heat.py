@@ -79,11 +79,9 @@ class Heated(Schedule):
         given = torch.as_tensor(capacity, dtype=torch.float64)
         if given.shape not in ((), (1,), (self.joints,)):
             raise ValueError(
-                f"`capacity` must be a number or one for each of {self.joints} joints, got "
-                f"shape {tuple(given.shape)}."
+                f"`capacity` must be 1 number or {self.joints}, got shape {tuple(given.shape)}."
             )
-        given = given.expand(self.joints)
-        for value in given.tolist():
+        for value in given.flatten().tolist():
             positive_number("capacity", value, "J")
         self.log_heat_capacity.copy_(given.log())
         self.log_cooling_time.fill_(math.log(positive_number("cooling_time", cooling_time, "s")))

@@ -23,8 +23,6 @@ from nfriction.fuzzy.partition import FreePartition
 
 # Smallest initial ratio of a coefficient to its scale: starting from zero it could not rise.
 LEAST_RATIO = 1e-3
-# A coefficient that no fit varies need not rise, e.g. the effect of heat in a joint without it.
-NO_RATIO = 1e-6
 # With a third of this, the network is too stiff to follow large swings, and then wrong at smaller
 # ones: 6.8 mrad instead of 3.0 on later swings of a real pendulum (its constant law: 5.3).
 PRIOR_SD = 0.3
@@ -229,7 +227,8 @@ class NeuroFuzzy(Schedule):
         self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
         lowest = torch.full_like(ratio, least)
-        lowest[:, self.outputs :] = NO_RATIO
+        # One that no fit varies need not rise, such as the fall by heat of a joint without any.
+        lowest[:, self.outputs :] = 1e-6
         lifted = smooth_relu_inverse(ratio.maximum(lowest), self.roundness)
         self.reference.copy_(torch.where(self.positive, lifted, ratio))
 

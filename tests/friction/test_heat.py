@@ -171,7 +171,7 @@ def test_initial_values_may_be_those_of_the_law_alone() -> None:
 
 
 def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"each of 2 joints, got shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"1 number or 2, got shape \(3,\)"):
         warming().schedule.set_heat([1.0, 2.0, 3.0], 1.0, 1.0)
 
 

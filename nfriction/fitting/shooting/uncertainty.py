@@ -29,6 +29,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.friction.inputs import is_heated
 from nfriction.optim.least_squares import LeastSquaresResult
 
 # Counts per turn of a coarse encoder that is still in use.
@@ -178,6 +179,9 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     it is the same each time, so that averaging over samples does not remove it.
     """
     variables, x = problem.variables, result.x
+    if problem.friction.schedule.state_size and not is_heated(problem.friction.law):
+        # Its hidden state advances with samples, as in a controller: finer steps make another one.
+        return torch.zeros_like(x)
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
     finer = replace(problem, substeps=FINER * problem.substeps)

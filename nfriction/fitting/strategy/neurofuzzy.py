@@ -10,7 +10,6 @@ windows improve. Every window is held out in turn, and a gain must exceed its sc
 import copy
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
@@ -99,12 +98,15 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     contest = _Contest(aligned, widened or start)
     chosen: tuple[InputGain, ...] = ()
     model = task.model
-    with suppress(StoppedError):
+    try:
         if widened is None:
             raise StoppedError
         contest.train()
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
+    except StoppedError:
+        if contest.best is not None:
+            contest.best = replace(contest.best, end=contest.best.end.as_stopped())
     if chosen:
         cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     found = replace(
