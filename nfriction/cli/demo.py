@@ -106,8 +106,8 @@ def add_reproduce(commands: Commands) -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder to write")
     parser.add_argument("--quick", action="store_true",
-                        help="recordings of 10 s and shorter searches: a few minutes on two "
-                        "cores")  # fmt: skip
+                        help="recordings of 10 s and shorter searches: a quarter of an hour on "
+                        "one core")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="seed of the encoders' errors and of the searches")  # fmt: skip
     parser.add_argument("--jobs", type=count, default=2, help="models trained in parallel")
