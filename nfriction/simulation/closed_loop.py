@@ -21,12 +21,12 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     as_stateful,
+    with_sample_time,
 )
 from nfriction.simulation.rollout import simulate
 from nfriction.simulation.validate import (
     outside_inference_mode,
     require_stability,
-    stepping_by,
     validate_inputs,
     with_states,
 )
@@ -141,7 +141,7 @@ def control(
     """
     model = NoFriction(plant.joints) if friction is None else friction
     sample_time, substeps = electronics.sample_time, electronics.substeps
-    model = stepping_by(model, torch.tensor([sample_time]).double())
+    model = with_sample_time(model, torch.tensor([sample_time]).double())
     given = with_states(
         validate_inputs(plant, model, q0, qd0, None, sample_time, steps, substeps), model
     )

@@ -1,10 +1,12 @@
 """Interfaces, inputs and result of a rollout: mechanism, friction, what drives it, the motion."""
 
+import copy
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -71,6 +73,33 @@ def as_stateful(friction: Friction) -> StatefulFriction | None:
     if getattr(friction, "state_size", 0) > 0:
         return cast(StatefulFriction, friction)
     return None
+
+
+def at_sample_time(schedule: Any, sample_time: float) -> Any:
+    """The schedule, or a copy with its parameters whose hidden state advances by this time [s]."""
+    meant = getattr(schedule, "sample_time", None)
+    # Clocks jitter, and time constants are known less exactly than to a thousandth.
+    if meant is None or math.isclose(meant, sample_time, rel_tol=1e-3):
+        return schedule
+    moved = copy.deepcopy(schedule, {id(p): p for p in schedule.parameters()})
+    moved.set_sample_time(sample_time)
+    return moved
+
+
+def with_sample_time(friction: Any, step: Tensor) -> Any:
+    """The model, or a copy with its parameters whose hidden state advances by these steps [s]."""
+    schedule = getattr(friction, "schedule", None)
+    if getattr(schedule, "sample_time", None) is None or not step.numel():
+        return friction
+    rows = step.contiguous().median(-1).values  # NaN of an expanded tensor, in torch 2.13
+    if rows.max() > 1.1 * rows.min():  # less is jitter
+        raise ValueError(
+            "a hidden state needs one `sample_time` for a batch, got "
+            f"{float(rows.min()):g} to {float(rows.max()):g} s; simulate each rate by itself."
+        )
+    moved = copy.copy(friction)
+    moved._modules = {**moved._modules, "schedule": at_sample_time(schedule, float(rows.max()))}
+    return moved
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,13 @@ from nfriction.simulation.protocols import (
     Rollout,
     RolloutInputs,
     StepFunction,
+    with_sample_time,
 )
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
     outside_inference_mode,
     require_stability,
-    stepping_by,
     validate_inputs,
     validate_measured,
     with_states,
@@ -102,7 +102,7 @@ def rollout(
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
-    model = stepping_by(model, inputs.step)
+    model = with_sample_time(model, inputs.step)
     inputs = with_states(inputs, model, hidden_state, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")

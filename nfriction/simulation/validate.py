@@ -1,7 +1,5 @@
 """Validation of a rollout's arguments."""
 
-import copy
-import logging
 import math
 from collections.abc import Callable, Hashable
 from dataclasses import replace
@@ -17,8 +15,6 @@ from nfriction import codegen
 from nfriction.simulation.compiled import System
 from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
-
-logger = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -250,30 +246,3 @@ def _fastest_decay(system: System) -> float:
         rates = system.plant.decay_rate(system.friction.zero_velocity_damping())
         _decay_rates[key] = float(rates.max())
     return _decay_rates[key]
-
-
-def at_sample_time(schedule: Any, sample_time: float) -> Any:
-    """The schedule, or a copy with its parameters whose hidden state advances by this time [s]."""
-    meant = getattr(schedule, "sample_time", None)
-    # Clocks jitter, and time constants are known less exactly than to a thousandth.
-    if meant is None or math.isclose(meant, sample_time, rel_tol=1e-3):
-        return schedule
-    moved = copy.deepcopy(schedule, {id(p): p for p in schedule.parameters()})
-    moved.set_sample_time(sample_time)
-    return moved
-
-
-def stepping_by(friction: Any, step: Tensor) -> Any:
-    """The model, or a copy with its parameters whose hidden state advances by these steps [s]."""
-    schedule = getattr(friction, "schedule", None)
-    if getattr(schedule, "sample_time", None) is None or not step.numel():
-        return friction
-    rows = step.contiguous().median(-1).values  # NaN of an expanded tensor, in torch 2.13
-    if rows.max() > 1.1 * rows.min():  # less is jitter
-        raise ValueError(
-            "a hidden state needs one `sample_time` for a batch, got "
-            f"{float(rows.min()):g} to {float(rows.max()):g} s; simulate each rate by itself."
-        )
-    moved = copy.copy(friction)
-    moved._modules = {**moved._modules, "schedule": at_sample_time(schedule, float(rows.max()))}
-    return moved

@@ -11,7 +11,7 @@ from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelFileError
-from nfriction.simulation.validate import at_sample_time
+from nfriction.simulation.protocols import at_sample_time
 from tests.fitting.recordings import pendulum
 from tests.friction.samples import motion, warming_network
 

@@ -17,7 +17,8 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.simulation.validate import RK4_STABILITY, at_sample_time, required_substeps
+from nfriction.simulation.protocols import at_sample_time
+from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4])

@@ -15,7 +15,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
-from nfriction.simulation.validate import at_sample_time
+from nfriction.simulation.protocols import at_sample_time
 
 
 def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:

@@ -11,7 +11,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
-from nfriction.simulation.validate import at_sample_time
+from nfriction.simulation.protocols import at_sample_time
 
 CLASSES = ("low", "medium", "high")
 

@@ -13,7 +13,7 @@ from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import RBFNetwork
-from nfriction.simulation.validate import at_sample_time
+from nfriction.simulation.protocols import at_sample_time
 
 
 class RBFCoefficients(Schedule):
