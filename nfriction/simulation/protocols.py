@@ -95,7 +95,7 @@ def with_sample_time(friction: Any, step: Tensor) -> Any:
     if rows.max() > 1.1 * rows.min():  # less is jitter
         raise ValueError(
             "a hidden state needs one `sample_time` for a batch, got "
-            f"{float(rows.min()):g} to {float(rows.max()):g} s; simulate each rate by itself."
+            f"{float(rows.min()):g} to {float(rows.max()):g} s; simulate each rate separately."
         )
     moved = copy.copy(friction)
     moved._modules = {**moved._modules, "schedule": at_sample_time(schedule, float(rows.max()))}
