@@ -242,17 +242,17 @@ def pt2(
 def _program(controller: Controller, metadata: str) -> bytes:
     """The artefact's content."""
     program = exported(controller)
-    try:
-        program.example_inputs = None  # torch would pickle them
-    except ValueError as error:
-        raise ExportError(
-            f"torch {torch.__version__} writes pickled objects into a .pt2; use a newer one for it."
-        ) from error
     for node in program.graph.nodes:  # the stack contains this machine's folders
         node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
-    with silent():
-        torch.export.save(program, buffer, extra_files={METADATA: metadata})
+    try:
+        program.example_inputs = None  # torch would pickle them
+        with silent():
+            torch.export.save(program, buffer, extra_files={METADATA: metadata})
+    except ValueError as error:
+        raise ExportError(
+            f"torch {torch.__version__} cannot write a .pt2 of it; use a newer one ({error})."
+        ) from error
     return buffer.getvalue()
 
 
@@ -316,7 +316,9 @@ def exported(controller: Controller) -> torch.export.ExportedProgram:
     try:
         with silent():
             shapes = tuple({0: batch} for _ in example)
-            return torch.export.export(kind(controller).eval(), example, dynamic_shapes=shapes)
+            module = kind(controller).eval()
+            # Without `strict`, torch 2.11 refuses products of broadcast tensors.
+            return torch.export.export(module, example, dynamic_shapes=shapes, strict=True)
     except (RuntimeError, TypeError, ValueError, AttributeError) as error:
         raise ExportError(f"torch cannot export the model:\n{error}") from error
 

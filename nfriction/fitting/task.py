@@ -19,6 +19,7 @@ from nfriction.fitting.data.inputs import (
     largest_torques,
     looks_zeroed_per_recording,
     measurement_matrix,
+    require_doubles,
     require_drive,
     smoothed_motions,
 )
@@ -91,9 +92,10 @@ def prepare_task(
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
     # Checked before much time is spent on recordings.
-    modelled = as_model(model, plant.joints).joints
+    checked = as_model(model, plant.joints)
+    require_doubles(checked, plant)
     given = as_recording_list(recordings, plant)
-    joint = in_joint_coordinates(plant, given, modelled)
+    joint = in_joint_coordinates(plant, given, checked.joints)
     moved = smoothed_motions(joint, motions)
     model = as_model(model, plant.joints, moved)
     if "p_0" in model.law.names:

@@ -633,3 +633,16 @@ def test_what_ends_at_zero_is_told_as_none_of_it():
     assert {"B of joint1", "drag quadratic"} <= set(found.at_bounds)
     assert f"At zero: {', '.join(found.at_bounds)}; the data show no such effect." in found.warnings
     assert not any("beyond" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("device", "dtype", "message"),
+    [("cpu", torch.float32, "float32 on cpu"), ("meta", F64, "float64 on meta")],
+)
+def test_fits_need_double_precision_on_the_cpu(device, dtype, message) -> None:
+    link = one_link()
+    swung = swing(link, NCFM(1), seconds=0.3)
+    with pytest.raises(ValueError, match=f"needs float64 on the CPU, got torch.{message} in the m"):
+        fit(NCFM(1).to(device, dtype), link, swung)
+    with pytest.raises(ValueError, match=f"got torch.{message} in the plant"):
+        fit(NCFM(1), link.to(device, dtype), swung)

@@ -538,6 +538,11 @@ def test_inference_mode_changes_nothing(backend, scheme):
         torch.testing.assert_close(motion(), expected, rtol=0, atol=1e-12)
 
 
+def test_tensors_on_two_devices_are_named() -> None:
+    with pytest.raises(ValueError, match="q0 on cpu, plant on cpu, friction model on meta"):
+        run(smooth_model().to("meta"), steps=5)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -9,7 +9,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import torch
@@ -60,6 +60,21 @@ def as_model(
             f"{type(model).__name__} {textwrap.shorten(repr(model), 60)}."
         )
     return model
+
+
+def require_doubles(model: torch.nn.Module, plant: torch.nn.Module) -> None:
+    """Refuse a model or plant in single precision, whose rounding ends searches early, or on a GPU.
+
+    Raises:
+        ValueError: if a parameter or buffer is not float64 on the CPU.
+    """
+    for name, of in (("model", model), ("plant", plant)):
+        for x in chain(of.parameters(), of.buffers()):
+            if x.device.type != "cpu" or (x.is_floating_point() and x.dtype != torch.float64):
+                raise ValueError(
+                    f"a fit needs float64 on the CPU, got {x.dtype} on {x.device} in the {name}: "
+                    f'`{name}.to("cpu", torch.float64)`.'
+                )
 
 
 def turning_velocity(motions: Sequence[Motion]) -> float:
