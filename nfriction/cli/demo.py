@@ -37,10 +37,7 @@ def run_demo(arguments: argparse.Namespace) -> int:
     from nfriction.papers import twin
 
     simulated = twin.make(
-        "tlrip",
-        seed=arguments.seed,
-        duration=arguments.seconds,
-        progress=sys.stderr.isatty(),
+        "tlrip", seed=arguments.seed, duration=arguments.seconds, progress=sys.stderr.isatty()
     )
     plant, train, test = simulated.plant, simulated.part("train"), simulated.part("test")
     print(

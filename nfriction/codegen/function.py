@@ -121,11 +121,7 @@ class CompiledFunction:
                 eager = self._eager([x.to(self._module.device) for x in inputs])
             # Enough rows for the vector code, which most calls use.
             ours = self(*(x.expand(FEW, *x.shape) for x in inputs))
-            for a, b in zip(
-                ours if isinstance(ours, tuple) else (ours,),
-                eager,
-                strict=True,
-            ):
+            for a, b in zip(ours if isinstance(ours, tuple) else (ours,), eager, strict=True):
                 expected = to_array(b)
                 tolerance = _CHECK_TOLERANCE
                 if not np.allclose(a[0], expected, tolerance, tolerance, equal_nan=True):

@@ -218,9 +218,7 @@ def _decomposed(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, A
 
 
 def trace(
-    function: Callable[..., Any],
-    inputs: Mapping[str, Tensor],
-    parameters: Collection[str] = (),
+    function: Callable[..., Any], inputs: Mapping[str, Tensor], parameters: Collection[str] = ()
 ) -> Program:
     """Run `function(**inputs)` symbolically.
 

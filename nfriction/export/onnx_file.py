@@ -195,9 +195,7 @@ def _atan(g: OnnxGraph, x: Value) -> Value:
     # With s = sin y and c = cos y this is tan(arctan(x) - y), so small that it is its arctangent.
     s, c = g.emit("Sin", y), g.emit("Sin", g.emit("Add", y, 0.5 * math.pi))
     tangent = g.emit(
-        "Div",
-        g.emit("Sub", g.emit("Mul", x, c), s),
-        g.emit("Add", c, g.emit("Mul", x, s)),
+        "Div", g.emit("Sub", g.emit("Mul", x, c), s), g.emit("Add", c, g.emit("Mul", x, s))
     )
     return g.emit("Add", y, tangent)
 

@@ -115,9 +115,7 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
         partial(steady_hysteresis, loaded=loaded, count=count),
         # No partial, which TorchScript would not compile.
         memory=Memory(
-            count + 1,
-            advance_hysteresis,
-            load_hysteresis_torque if loaded else hysteresis_torque,
+            count + 1, advance_hysteresis, load_hysteresis_torque if loaded else hysteresis_torque
         ),
     )
 

@@ -254,9 +254,7 @@ VISCOUS = Law("viscous", (Coefficient("C_p", "N m s/rad"),), viscous)
 COULOMB = Law("coulomb", (Coefficient("F_c", "N m"),), coulomb)
 
 COULOMB_VISCOUS = Law(
-    "coulomb_viscous",
-    (Coefficient("F_c", "N m"), Coefficient("F_v", "N m s/rad")),
-    coulomb_viscous,
+    "coulomb_viscous", (Coefficient("F_c", "N m"), Coefficient("F_v", "N m s/rad")), coulomb_viscous
 )
 
 LINEAR = Law("linear", (Coefficient("B", "N m s/rad"), Coefficient("C", "N m")), linear)

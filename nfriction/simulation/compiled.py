@@ -96,9 +96,7 @@ def integrate_compiled(
 
 
 def _compiled(
-    system: System,
-    backend: Backend,
-    step_function: StepFunction = rk4_step,
+    system: System, backend: Backend, step_function: StepFunction = rk4_step
 ) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this system, from the cache if it is there."""
     plant, friction = system.plant, system.friction

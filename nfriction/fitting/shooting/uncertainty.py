@@ -13,11 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.result.identifiability import (
-    Information,
-    information,
-    observed_count,
-)
+from nfriction.fitting.result.identifiability import Information, information, observed_count
 from nfriction.fitting.robust_loss import SQUARES
 from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.normal_equations import (

@@ -30,11 +30,7 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.further_terms import delay_warning, richer_by_evidence
-from nfriction.fitting.strategy.presliding import (
-    TRAVELLED,
-    ambiguous_stiffness,
-    presliding_starts,
-)
+from nfriction.fitting.strategy.presliding import TRAVELLED, ambiguous_stiffness, presliding_starts
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -196,10 +192,7 @@ def warm_start_from_nested(
 
 
 def best_of_starts(
-    fitter: ShootingFitter,
-    own: HorizonResult,
-    nested: HorizonResult,
-    equation_error: EquationError,
+    fitter: ShootingFitter, own: HorizonResult, nested: HorizonResult, equation_error: EquationError
 ) -> HorizonResult:
     """The end of a law's own search, or a lower one reached from the end of its nested law.
 

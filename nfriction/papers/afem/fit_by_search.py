@@ -318,12 +318,7 @@ def _steps(local: Quadratic, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _polled(
-    cost: Cost,
-    box: Box,
-    state: SearchState,
-    seed: int,
-    local: Quadratic | None,
-    negligible: float,
+    cost: Cost, box: Box, state: SearchState, seed: int, local: Quadratic | None, negligible: float
 ) -> SearchState:
     x, last = box.start.new_tensor(state.point), box.start.new_tensor(state.step)
     # A separate generator per iteration, so a resumed search needs no generator state.

@@ -6,13 +6,7 @@ from nfriction.papers.controller.mamdani import (
     controller_surface,
     paper_controller,
 )
-from nfriction.papers.controller.rules import (
-    Rule,
-    RuleBase,
-    Variable,
-    load_rules,
-    parse_rules,
-)
+from nfriction.papers.controller.rules import Rule, RuleBase, Variable, load_rules, parse_rules
 
 __all__ = [
     "MamdaniController", "Rule", "RuleBase", "Variable", "controller_surface", "load_fis",

@@ -394,12 +394,7 @@ class Posterior(NamedTuple):
 
 
 def posterior(
-    local: NormalEquations,
-    offset: Tensor,
-    groups: Tensor,
-    samples: int,
-    alpha: Tensor,
-    beta: float,
+    local: NormalEquations, offset: Tensor, groups: Tensor, samples: int, alpha: Tensor, beta: float
 ) -> Posterior:
     """Posterior, effective parameters and log evidence; exact if the model is linear.
 

@@ -6,10 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import (
-    apply_encoder_offsets,
-    require_motion,
-)
+from nfriction.fitting.data.inputs import apply_encoder_offsets, require_motion
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_shooting

@@ -187,11 +187,9 @@ def _variable(name: str, unit: str, terms: Sequence[str], ranges: Ranges) -> Var
 def _range(term: FuzzySet) -> tuple[float, float]:
     """The range in Table 4 that corresponds to a set, see `sets_from_ranges`."""
     centre, sigma = term.parameters
-    reach = {
-        "left_shoulder": (0.0, 2.0),
-        "gaussian": (-2.0, 2.0),
-        "right_shoulder": (-2.0, 0.0),
-    }[term.shape]
+    reach = {"left_shoulder": (0.0, 2.0), "gaussian": (-2.0, 2.0), "right_shoulder": (-2.0, 0.0)}[
+        term.shape
+    ]
     return centre + reach[0] * sigma, centre + reach[1] * sigma
 
 

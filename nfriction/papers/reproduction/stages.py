@@ -95,11 +95,7 @@ def stages() -> dict[str, Stage]:
 
 
 def reproduce(
-    folder: str | Path,
-    settings: Settings = FULL,
-    *,
-    jobs: int = 2,
-    progress: bool = False,
+    folder: str | Path, settings: Settings = FULL, *, jobs: int = 2, progress: bool = False
 ) -> Workspace:
     """Run every stage that is not finished.
 
@@ -208,12 +204,7 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
 
 
 def fit_from_start(
-    workspace: Workspace,
-    bench: Bench,
-    name: str,
-    *,
-    start: FitResult | None = None,
-    **options: Any,
+    workspace: Workspace, bench: Bench, name: str, *, start: FitResult | None = None, **options: Any
 ) -> FitResult:
     """A model with these options, fitted to trajectories, from an earlier fit or none."""
     settings = workspace.settings
@@ -349,11 +340,7 @@ def controlled(workspace: Workspace, name: str) -> dict[str, Any]:
 
 
 def _judged(
-    workspace: Workspace,
-    stage: str,
-    bench: Bench,
-    model: FrictionModel,
-    ended: Mapping[str, Any],
+    workspace: Workspace, stage: str, bench: Bench, model: FrictionModel, ended: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Status of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)

@@ -73,11 +73,7 @@ class Order(NamedTuple):
 
 
 def rmse(
-    workspace: Workspace,
-    models: Sequence[str],
-    *,
-    split: str = "test",
-    drive: Drive = "free_run",
+    workspace: Workspace, models: Sequence[str], *, split: str = "test", drive: Drive = "free_run"
 ) -> pd.DataFrame:
     """Position RMSE over all recordings of a split, by model (row) and joint (column) [rad]."""
     rows = {}
