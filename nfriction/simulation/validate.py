@@ -90,7 +90,13 @@ def validate_inputs(
         check(plant)
     q0 = as_tensor("q0", q0)
     qd0 = as_tensor("qd0", qd0).to(q0)
-    _require_one_device(q0, plant, friction)
+    modules = (m for m in (plant, friction) if isinstance(m, torch.nn.Module))
+    devices = {x.device.type for m in modules for x in (*m.parameters(), *m.buffers(), q0)}
+    if len(devices) > 1:
+        raise ValueError(
+            "plant, friction model and `q0` must be on one device, got "
+            f"{' and '.join(sorted(devices))}; move them with `.to(device)`."
+        )
     for name, value in (("q0", q0), ("qd0", qd0)):
         if value.ndim == 0 or value.shape[-1] != joints:
             raise ValueError(
@@ -122,16 +128,6 @@ def validate_inputs(
         shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
         raise ValueError(f"batches must be the same, 1 or omitted, got {shown}.") from None
     return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
-
-
-def _require_one_device(q0: Tensor, plant: Any, friction: Any) -> None:
-    known = {"q0": q0.device.type}
-    for name, of in (("plant", plant), ("friction model", friction)):
-        if isinstance(of, torch.nn.Module):
-            known |= {name: x.device.type for x in (*of.parameters(), *of.buffers())}
-    if len(set(known.values())) > 1:
-        shown = ", ".join(f"{name} on {device}" for name, device in known.items())
-        raise ValueError(f"a rollout needs one device, got {shown}; move them with `.to(device)`.")
 
 
 def _step_count(steps: int | None, step: Tensor, torque: Tensor | None) -> int:
