@@ -64,8 +64,8 @@ def as_tensor(name: str, value: Any) -> Tensor:
                 f"`{name}` must be a tensor, an array or a list of numbers with rows of one "
                 f"length, got {type(value).__name__}: {error}"
             ) from None
-    if found.is_complex():
-        raise ValueError(f"`{name}` must be real, got {found.dtype}; take its real part.")
+    if found.is_complex() or (found.is_floating_point() and found.element_size() < 4):
+        raise ValueError(f"`{name}` must be real, float32 or float64, got {found.dtype}.")
     return found if found.is_floating_point() else found.to(torch.float64)
 
 
@@ -94,7 +94,7 @@ def validate_inputs(
     devices = {x.device.type for m in modules for x in (*m.parameters(), *m.buffers(), q0)}
     if len(devices) > 1:
         raise ValueError(
-            "plant, friction model and `q0` must be on one device, got "
+            "plant, friction model and `q0` (of recordings: the CPU) must be on one device, got "
             f"{' and '.join(sorted(devices))}; move them with `.to(device)`."
         )
     for name, value in (("q0", q0), ("qd0", qd0)):

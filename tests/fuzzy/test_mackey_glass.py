@@ -11,7 +11,7 @@ FLOAT64 = torch.float64
 
 
 @pytest.fixture(scope="module")
-def benchmark() -> ModuleType:
+def series() -> ModuleType:
     path = Path(__file__).parents[2] / "benchmarks" / "mackey_glass.py"
     if not path.exists():
         pytest.skip("a distribution has no benchmarks")
@@ -23,24 +23,24 @@ def benchmark() -> ModuleType:
     return module
 
 
-def test_it_decays_until_the_delayed_value_arrives(benchmark: ModuleType) -> None:
+def test_it_decays_until_the_delayed_value_arrives(series: ModuleType) -> None:
     # For t <= tau the delayed value is 0, so that x(t) = 1.2 exp(-0.1 t).
     t = torch.arange(18, dtype=FLOAT64)
     wanted = 1.2 * torch.exp(-0.1 * t)
-    torch.testing.assert_close(benchmark.mackey_glass(17), wanted, rtol=1e-8, atol=0)
+    torch.testing.assert_close(series.mackey_glass(17), wanted, rtol=1e-8, atol=0)
 
 
-def test_the_integration_is_of_fourth_order(benchmark: ModuleType) -> None:
-    coarse, fine, finest = (benchmark.mackey_glass(60, step=h) for h in (0.1, 0.05, 0.025))
+def test_the_integration_is_of_fourth_order(series: ModuleType) -> None:
+    coarse, fine, finest = (series.mackey_glass(60, step=h) for h in (0.1, 0.05, 0.025))
     ratio = float((coarse - fine).norm() / (fine - finest).norm())
     assert 12 < ratio < 20  # 2^4, and terms of higher order
     # Chaos grows what is left by some thousand times over the whole series.
-    whole = benchmark.mackey_glass(1123) - benchmark.mackey_glass(1123, step=0.05)
+    whole = series.mackey_glass(1123) - series.mackey_glass(1123, step=0.05)
     assert whole.abs().max() < 1e-5
 
 
-def test_pairs_are_four_past_values_and_one_to_come(benchmark: ModuleType) -> None:
-    x, y = benchmark.pairs(torch.arange(1124, dtype=FLOAT64))
+def test_pairs_are_four_past_values_and_one_to_come(series: ModuleType) -> None:
+    x, y = series.pairs(torch.arange(1124, dtype=FLOAT64))
     assert x.shape == (1000, 4)
     assert x[0].tolist() == [100, 106, 112, 118]
     assert (y[:, 0] - x[:, 3] == 6).all()

@@ -560,6 +560,7 @@ def test_tensors_on_two_devices_are_named() -> None:
         ({"tau": [[0.0, 0.0], [0.0]]}, "`tau` must be a tensor, an array or a list"),
         ({"tau": "none"}, "`tau` must be a tensor, an array or a list"),
         ({"steps": 5, "q0": torch.zeros(2) + 1j}, "`q0` must be real"),
+        ({"steps": 5, "q0": torch.zeros(2).half()}, "`q0` must be .* float32 or float64, got .*16"),
         ({"tau": torch.zeros(3, 5, 2), "q0": torch.zeros(2, 2)}, r"`q0` \(2,\), `tau` \(3,\)"),
         ({"steps": 5, "drive": "measured", "measured": (torch.zeros(5, 2),) * 3}, "two"),
         ({"steps": 5, "sample_time": -1e-3}, "positive"),
