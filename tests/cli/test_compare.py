@@ -44,7 +44,7 @@ def test_friction_predicts_better_than_none(compared: Path) -> None:
 
 
 def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
-    table = pd.read_csv(compared / "table.csv")
+    table = pd.read_csv(compared / "table.csv", float_precision="round_trip")
     models = results(compared)["models"]
     of = table[(table.horizon == "free run") & (table.joint == "all") & (table.recording == "b")]
     assert of.model.tolist() == ["no friction", "NCFM", "LFM", LIMIT]

@@ -112,7 +112,7 @@ def test_is_strict_c89_and_passes_its_own_test(exported, name, dtype):
     imports = subprocess.run(["nm", "-u", "n.o"], cwd=folder, capture_output=True, text=True)
     single = "f" if dtype == "float32" else ""
     allowed = {f + single for f in ("exp", "tanh", "atan", "log", "sqrt")}
-    assert set(re.findall(r"U (\w+)", imports.stdout)) <= allowed
+    assert set(re.findall(r"U ([a-z]\w*)", imports.stdout)) <= allowed  # not the compiler's own
     data = subprocess.run(["size", "-A", "n.o"], cwd=folder, capture_output=True, text=True).stdout
     sizes = dict(re.findall(r"^(\.data|\.bss)\s+(\d+)", data, re.M))
     assert sizes == {".data": "0", ".bss": "0"}, "no globals that change"

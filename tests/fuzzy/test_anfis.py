@@ -204,7 +204,7 @@ def test_script_and_export_are_the_same(options: dict) -> None:
     scripted = torch.jit.script(layer)
     torch.testing.assert_close(scripted(x), layer(x), rtol=1e-14, atol=1e-15)
     shapes = ({0: torch.export.Dim("samples")},)
-    program = torch.export.export(layer, (x,), dynamic_shapes=shapes)
+    program = torch.export.export(layer, (x,), dynamic_shapes=shapes, strict=True)
     z = samples(5, 3, 2, seed=3)
     torch.testing.assert_close(program.module()(z), layer(z), rtol=1e-14, atol=1e-15)
 

@@ -60,7 +60,7 @@ def test_script_export_and_vmap_are_the_same(kind: str) -> None:
     scripted = torch.jit.script(module)
     torch.testing.assert_close(scripted(x), module(x), rtol=1e-14, atol=1e-15)
     shapes = ({0: torch.export.Dim("samples")},)
-    program = torch.export.export(module, (x,), dynamic_shapes=shapes)
+    program = torch.export.export(module, (x,), dynamic_shapes=shapes, strict=True)
     torch.testing.assert_close(program.module()(z), module(z), rtol=1e-13, atol=1e-14)
     torch.testing.assert_close(torch.func.vmap(module)(x), module(x), rtol=1e-13, atol=1e-14)
 
