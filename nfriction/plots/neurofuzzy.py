@@ -311,8 +311,8 @@ def coefficient_sections(
             row = np.searchsorted(edges[1], accelerations) - 1
             seen = _near(_visits(rules, motions, j))[np.clip(row, 0, CELLS - 1)]
         at = ", ".join(f"{float(f'{a:.2g}'):g}" for a in accelerations).replace("-", "−")
-        style.title(panels[0], f"{names[j]}, at {at} {unit}/s²")
         for ax, (k, coefficient) in zip(panels, coefficients, strict=True):
+            style.title(ax, f"{names[j]}, at {at} {unit}/s²")
             factor = style.coefficient_axis(ax, coefficient, unit, values[..., k])
             value = factor * values[..., k]
             reach = 0.0 * value if sd is None else factor * NORMAL_95 * sd[..., k]
@@ -323,7 +323,7 @@ def coefficient_sections(
                     some = slice(_FIRST + n * _BESIDE, None, _APART)  # side by side
                     ax.errorbar(
                         speed[some], value[n, some], reach[n, some], fmt="none",
-                        ecolor=line["color"], elinewidth=0.9, capsize=1.5, capthick=0.9,
+                        ecolor=line["color"], elinewidth=0.6, capsize=1.5, capthick=0.6, alpha=0.6,
                     )  # fmt: skip
             _limit(ax, value, reach, coefficient.positive)
             ax.set_xlim(0.0, edges[0][-1])
