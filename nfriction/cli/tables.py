@@ -9,7 +9,6 @@ from nfriction.evaluation.cross_validation import Selection
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
 
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
@@ -53,26 +52,10 @@ def fit_lines(name: str, fit: FitResult, unfit: str = "") -> str:
     return "\n  - ".join(map(one_line, lines))
 
 
-# Terms of a plant that a fit gives as a relative change: the buffer that holds them, and its unit.
-_RELATIVE = {"inertia": ("inertia_coupling", "kg m^2"), "gravity": ("gravity_moment", "N m"),
-             "armature": ("armature", "kg m^2"), "mass": ("mass", "kg")}  # fmt: skip
-
-
-def _with_si(name: str, plant: Plant) -> str:
-    """The name of a parameter, and the fitted value of a term that is given as a change."""
-    term, _, place = name.partition(" ")
-    if term not in _RELATIVE:
-        return name
-    buffer, unit = _RELATIVE[term]
-    values = dict(plant.named_buffers())[buffer]
-    if values.ndim > 1:  # the inertia of link 2 is 22, on the diagonal
-        values, place = values.diagonal(), place[len(place) // 2 :]
-    return f"{name} ({values[int(place) - 1]:.4g} {unit})"
-
-
 def interval_table(fit: FitResult) -> str:
     """Values and 95 % intervals of constant coefficients and the plant's terms; empty of others."""
-    rows = [(_with_si(i.name, fit.plant), i.value, i.low, i.high) for i in fit.intervals]
+    names = fit.names_with_si()
+    rows = [(names.get(i.name, i.name), i.value, i.low, i.high) for i in fit.intervals]
     table = tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms))
     return str(table) if rows else ""
 

@@ -33,6 +33,8 @@ FEWEST_FOR_CURVATURE = 5
 FEWEST_BLOCKS = 20
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
+# Growth of friction that is named, relative to its mean; less hardly shows in a simulation.
+LEAST = 0.01
 
 
 @dataclass(frozen=True)
@@ -258,12 +260,10 @@ def _collect(
         stamps, margin = motion.time, options.edge + options.largest_delay
         inside = np.flatnonzero((stamps >= stamps[0] + margin) & (stamps <= stamps[-1] - margin))
         starts = np.arange(0, max(0, len(inside) - block + 1), stride)
-        chosen = inside[(starts[:, None] + np.arange(block)).ravel()]
-        since = stamps[chosen] - stamps[0]
-        torque = recording.torque_at(stamps[chosen] + delay + drift * since)
-        parts.append(
-            (motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], torque, since[:, None])
-        )
+        at = inside[(starts[:, None] + np.arange(block)).ravel()]
+        since = stamps[at] - stamps[0]
+        torque = recording.torque_at(stamps[at] + delay + drift * since)
+        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], torque, since[:, None]))
     q, qd, qdd, tau, time = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
     return _Data(q, qd, qdd, tau, time, block)
 
@@ -296,11 +296,8 @@ def _corrected_positions(
         for factor in (-1.0, 0.25, 0.5, 2.0, 4.0):
             scale[j, j] = factor
             # The counts of an encoder's revolution, in quadrature or not.
-            text = (
-                f"the sign of {name}'s position is reversed"
-                if factor < 0
-                else f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
-            )
+            large = f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
+            text = f"the sign of {name}'s position is reversed" if factor < 0 else large
             yield text, recorded(scale)
         # A half turn of the first link is a matter of the convention.
         turns = (-90, 90) if j == first else (-90, 90, 180)
@@ -358,8 +355,7 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
             # Some would be no mechanism, or a strange one.
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                corrected = plant.from_dict({**data, **parts})
-                yield text, corrected
+                yield text, plant.from_dict({**data, **parts})
 
 
 def _corrected_terms(
@@ -466,7 +462,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[str]:
-    """A sentence for each driven joint whose friction grows or falls, during recordings or between.
+    """A sentence for each joint whose friction grows or falls, during recordings or between them.
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay must not appear as a change:
     friction may be any function of speed plus a share of the torque, and the rig is fitted as well.
@@ -480,13 +476,10 @@ def changing_friction(
     # Time starts again with each recording.
     number = (time.diff(dim=0, prepend=time[:1]) < 0).cumsum(0).to(time)
     clocks = {"during a recording": time, "from the first recording to the last": number}
-    for j in np.flatnonzero(data.tau.abs().amax(0)).tolist():
-        friction, of_rig, sliding = _of_sliding(plant, data, j, options)
-        if (count := int(sliding.sum())) < 2 * pieces:
-            continue
-        means = friction, of_rig, data.mean(data.tau[:, [j]])
+    for j in range(plant.joints):
+        *means, sliding = _of_sliding(plant, data, j, options)
         terms = [x[sliding] for x in means]
-        if not all(bool(x.isfinite().all()) for x in terms):
+        if (count := len(terms[0])) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
         piece = torch.arange(count) * pieces // count
         for period, clock in clocks.items():
@@ -495,17 +488,19 @@ def changing_friction(
             if span == 0:
                 continue
             given = [*terms, clock[sliding] / span]
-            change = 100 * _growth(piece < 0, *given)[0]
+            rate = _growth(piece < 0, *given)[0]
             found = [_growth(piece == k, *given) for k in range(pieces)]
-            sd = 100 * math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
+            sd = math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
             constant, growing = torch.stack([squares for _, squares in found]).T
-            known = abs(change) > sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
-            if known and gains(growing, constant, options.drift_chance):
+            least = max(LEAST, sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2))
+            if abs(rate) > least and gains(growing, constant, options.drift_chance):
+                # From start to end as if exponential, so that no friction falls by over 100 %.
+                sd *= np.exp(rate) * student_quantile(pieces - 1, 0.975)
+                change, reach = (float(f"{100 * x:.2g}") for x in (abs(np.expm1(rate)), sd))
                 yield (
-                    f"The friction of {plant.joint_names[j]} {'grows' if change > 0 else 'falls'} "
-                    f"by {float(f'{abs(change):.2g}'):g} % (within "
-                    f"{sd * student_quantile(pieces - 1, 0.975):.2g} %) {period} (warm-up, "
-                    "payload); the intervals do not cover this."
+                    f"The friction of {plant.joint_names[j]} {'grows' if rate > 0 else 'falls'} by "
+                    f"{change:g} % (within {reach:g} %) {period} (warm-up, payload); the intervals "
+                    "do not cover this."
                 )
 
 
@@ -534,14 +529,14 @@ def loose_loads(
     elapsed = data.mean(data.time)[:, 0].diff()
     beside = (elapsed > 0) & (elapsed < 1.5 * elapsed.median())
     for j in geared:
-        friction, of_rig, sliding = _of_sliding(plant, data, j, options)
+        friction, of_rig, driving, sliding = _of_sliding(plant, data, j, options)
         load = needed[:, j] - own["armature"][j] * data.qdd[:, j]
         more = [torch.sign(data.qd[:, j]) * load.abs(), data.qdd[:, j], *(x[:, j] for x in wrong)]
         load = data.mean(load)
         turned = torch.nn.functional.pad((load[1:] * load[:-1] < 0) & beside, (1, 1))
         near = torch.stack([load * turned[1:], load * turned[:-1]], 1)
         known = torch.cat([friction, of_rig, data.mean(torch.stack(more, 1)), near], 1)[sliding]
-        torque = data.mean(data.tau[:, j])[sliding]
+        torque = driving[sliding, 0]
         if int(turned[:-1][sliding].sum()) < pieces // 2 or not bool(known.isfinite().all()):
             continue
         # Scaled, because most terms of a simple rig are sums of others.
@@ -562,10 +557,12 @@ def loose_loads(
             )
 
 
-def _of_sliding(
-    plant: Plant, data: _Data, j: int, options: FitOptions
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Block means of the friction and rig terms of a joint's torque, and the blocks of sliding."""
+def _of_sliding(plant: Plant, data: _Data, j: int, options: FitOptions) -> tuple[Tensor, ...]:
+    """Block means of friction and rig terms, of the torque that they explain, and what slides.
+
+    The terms are (block, term), the torque (block, 1): that of the drive or, without one, that
+    which slows the joint; its scale then is no term of the rig. What slides is (block,).
+    """
     rest = torch.zeros_like(data.q)
     static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
     speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
@@ -574,10 +571,13 @@ def _of_sliding(
     friction = torch.stack([torch.sign(data.qd[:, j]) * shape for shape in shapes], 1)
     rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
     late = rate.repeat_interleave(data.block)
-    of_rig = torch.stack([ones, static[:, j], needed[:, j], late], 1)
+    of_rig = torch.stack([ones, static[:, j], late, needed[:, j]], 1)
+    torque = data.tau[:, [j]]
+    if not torque.any():
+        of_rig, torque = of_rig[:, :-1], -needed[:, [j]]
     # Smoothed over a reversal, dry friction seems to depend on the acceleration.
     apart = data.mean(speed) > options.diagnosis_block * data.mean(data.qdd[:, j].abs())
-    return data.mean(friction), data.mean(of_rig), apart & (data.moving[:, j] > 0)
+    return *map(data.mean, (friction, of_rig, torque)), apart & (data.moving[:, j] > 0)
 
 
 def _growth(

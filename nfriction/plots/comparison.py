@@ -154,7 +154,7 @@ def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
     ax = axes[0, 0]
     finite = values[np.isfinite(values) & (values > 0)]
     largest, smallest = (finite.max(), finite.min()) if finite.size else (1.0, 1.0)
-    if style.spread(values) > style.LOG_FROM:
+    if largest > style.LOG_FROM * smallest:
         # A number above a bar takes up a share of the axis, not of the value.
         bottom, top = smallest / 2.5, largest * (largest / smallest) ** 0.3
         style.log_axis(ax, bottom, top)
@@ -309,8 +309,7 @@ def _intervals(found: FitResult, name: str, k: int) -> Array:
 
 
 DPI = 150
-RUN_KEY = "nfriction run"
-"""Key of the text in a PNG file that names its run."""
+RUN_KEY = "nfriction run"  # key of the text in a PNG file that names its run
 
 
 def save_all(
@@ -404,20 +403,14 @@ def _figures(
     models = {name: found.model for name, found in comparison.fits.items()}
     if given:
         motions = [trained[r.name] for r in given]
-        bands = {
-            name: found.uncertainty
-            for name, found in comparison.fits.items()
-            if found.uncertainty is not None
-        }
+        bands = {n: f.uncertainty for n, f in comparison.fits.items() if f.uncertainty is not None}
         figure = torque_over_velocity(last.plant, models, given, motions, uncertainty=bands)
         yield "torque_over_velocity", figure
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
-    for law in dict.fromkeys(model.law.name for model in models.values()):
-        # Constants along the motion are worth drawing only with coefficients that follow it.
-        sets = [m.schedule.coefficient_sets() for m in models.values() if m.law.name == law]
-        if any("always" not in of_model for of_model in sets):
-            figure = coefficients_over_time(models, last.motions[0], law=law, **labels)
-            yield f"over_time_{law}", figure
+    # Constants along the motion are worth drawing only with coefficients that follow it.
+    moving = [m for m in models.values() if "always" not in m.schedule.coefficient_sets()]
+    for law in dict.fromkeys(model.law.name for model in moving):
+        yield f"over_time_{law}", coefficients_over_time(models, moved[0], law=law, **labels)
     for name, found in comparison.fits.items():
         if (rules := found.model.schedule.fuzzy_rules()) is not None and not rules.constant:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}

@@ -156,10 +156,10 @@ def _frame(ax: Axes, view: _View, plant: Plant) -> None:
     ax.set_aspect("equal")
     for limit in (ax.set_xlim, ax.set_ylim):
         limit(-1.15 * view.reach, 1.15 * view.reach)
-    ax.set_xlabel("[m]")
+    ax.set(xlabel="[m]", ylabel="[m]")
     if isinstance(plant, LinearAxis):
         ax.axhline(0, color=style.FAINT, linewidth=1.0)
-        ax.set_yticks([])
+        ax.set(yticks=[], ylabel="")
     elif isinstance(plant, Rotor) and not plant.to_dict()["mass"]:
         ax.set(xticks=[], yticks=[], xlabel="")  # the size of a flywheel is unknown
         ax.set_axis_off()

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
+from nfriction.evaluation.tables import ZERO
 from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
@@ -20,6 +21,7 @@ from nfriction.plots import style
 from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
+Edges = tuple[Array, Array]
 
 _BEFORE: dict[str, Any] = {"linestyle": (0, (3, 1.5)), "linewidth": 0.8}
 _AFTER: dict[str, Any] = {"linestyle": "-", "linewidth": 1.3}
@@ -131,18 +133,16 @@ def draw_map(
     bar.set_label(f"{style.symbol(label[0])} [{unit}]", fontsize=style.LABEL, color=style.INK)
 
 
-Edges = tuple[Array, Array]
-
-CELLS = 60
-"""Cells of a map along each axis."""
-NEAR = 3
-"""Cells around a sample that count as seen: a twentieth of the range."""
+CELLS = 60  # of a map along each axis
+NEAR = 3  # cells around a sample that count as seen: a twentieth of the range
+# Standard deviation, as a share of the coefficient's mean size, at which a map is half faded.
 VAGUE = 0.5
-"""Standard deviation, as a share of the coefficient's mean size, at which a map is half faded."""
 _FIRST, _BESIDE, _APART = 2, 2, 10  # cells, of error bars
 _LEAST = 0.15  # opacity of seen but uncertain cells; nothing is drawn where nothing was seen
 _UNDER, _OVER = "#101010", "#fefefe"
 _UNSEEN: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.5}
+# A network's line is steep in places, where dashes would not show its course.
+_SOLID: dict[str, Any] = {"linestyle": "-", "linewidth": 0.8}
 
 
 def coefficients_over_time(
@@ -154,6 +154,9 @@ def coefficients_over_time(
     unit: str = "rad",
 ) -> Figure:
     """Coefficients of models of one law along a motion, one panel per coefficient and joint.
+
+    Those that are constant in all models and joints have no panel: their values are in the title,
+    in the order of the models.
 
     Args:
         models: by name, with equally many joints; constant, adaptive or neuro-fuzzy.
@@ -171,23 +174,36 @@ def coefficients_over_time(
         raise ValueError(f"`models` must be one or several of one law, got {sorted(laws)}.")
     first = next(iter(models.values()))
     names = style.joint_labels(joint_names, first.joints)
-    along = [_along(model, motion) for model in models.values()]
-    rows = len(first.law.coefficients)
-    figure, axes = style.panels(rows, first.joints, style.PAGE, 0.4 + 1.25 * rows, sharex=True)
-    for k, coefficient in enumerate(first.law.coefficients):
-        for j, ax in enumerate(axes[k]):
-            values = np.stack([found[:, j, k] for found in along])
-            values = style.coefficient_axis(ax, coefficient, unit, values) * values
-            for name, value in zip(models, values, strict=True):
-                ax.plot(motion.time, value, **looks[name].line)
+    along, of_law = np.stack([_along(m, motion) for m in models.values()]), first.law.coefficients
+    varies = (np.ptp(along, 1) > 1e-6 * np.abs(along).max(1)).any((0, 1))  # more than rounding
+    rows, still = np.flatnonzero(varies), np.flatnonzero(~varies)
+    height = 0.5 + 1.25 * len(rows) + 0.15 * len(still)
+    figure, axes = style.panels(len(rows) or 1, first.joints, style.PAGE, height, sharex=True)
+    rules = {name: model.schedule.fuzzy_rules() for name, model in models.items()}
+    lines = {n: looks[n].line | (_SOLID if r and not r.constant else {}) for n, r in rules.items()}
+    for j, column in enumerate(axes.T):
+        text = [_value(of_law[k], unit, along[:, 0, j, k]) for k in still]
+        style.title(column[0], "\n".join([names[j], *["constant:"][: len(text)], *text]))
+        column[0].axison = len(rows) > 0
+        column[-1].set_xlabel("time [s]")
+        for k, ax in zip(rows, column, strict=False):
+            values = along[:, :, j, k]
+            values = style.coefficient_axis(ax, of_law[k], unit, values) * values
+            for line, value in zip(lines.values(), values, strict=True):
+                ax.plot(motion.time, value, **line)
             ax.set_ylim(style.padded(float(values.min()), float(values.max())))
             ax.margins(x=0.01)
-            if k == 0:
-                style.title(ax, names[j])
-    for ax in axes[-1]:
-        ax.set_xlabel("time [s]")
-    style.legend(figure, [looks[name].handle for name in models], list(models))
+    style.legend(figure, [Line2D([], [], **line) for line in lines.values()], list(lines))
     return figure
+
+
+def _value(coefficient: Coefficient, position: str, values: Array) -> str:
+    """A coefficient of every model with its unit; one number if they are equal."""
+    values = np.where(np.abs(values) > ZERO, values, 0.0)
+    factor, unit = style.scaled(style.sliding(coefficient.unit, position), values)
+    texts = [f"{x:.3g}" for x in factor * values]
+    number = " / ".join(texts) if len(set(texts)) > 1 else texts[0]
+    return f"{style.symbol(coefficient.name)} = {number} {unit}".removesuffix(" -")
 
 
 def _along(model: FrictionModel, motion: Motion) -> Array:
@@ -295,8 +311,8 @@ def coefficient_sections(
             row = np.searchsorted(edges[1], accelerations) - 1
             seen = _near(_visits(rules, motions, j))[np.clip(row, 0, CELLS - 1)]
         at = ", ".join(f"{float(f'{a:.2g}'):g}" for a in accelerations).replace("-", "−")
-        style.title(panels[0], f"{names[j]}, at {at} {unit}/s²")
         for ax, (k, coefficient) in zip(panels, coefficients, strict=True):
+            style.title(ax, f"{names[j]}, at {at} {unit}/s²")
             factor = style.coefficient_axis(ax, coefficient, unit, values[..., k])
             value = factor * values[..., k]
             reach = 0.0 * value if sd is None else factor * NORMAL_95 * sd[..., k]
@@ -307,7 +323,7 @@ def coefficient_sections(
                     some = slice(_FIRST + n * _BESIDE, None, _APART)  # side by side
                     ax.errorbar(
                         speed[some], value[n, some], reach[n, some], fmt="none",
-                        ecolor=line["color"], elinewidth=0.9, capsize=1.5, capthick=0.9,
+                        ecolor=line["color"], elinewidth=0.6, capsize=1.5, capthick=0.6, alpha=0.6,
                     )  # fmt: skip
             _limit(ax, value, reach, coefficient.positive)
             ax.set_xlim(0.0, edges[0][-1])

@@ -182,13 +182,6 @@ def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
     return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]
 
 
-def spread(values: Any) -> float:
-    """Largest finite value over the smallest positive one; 1 if there are none."""
-    known = np.asarray(values, dtype=np.float64)
-    known = known[np.isfinite(known) & (known > 0)]
-    return float(known.max() / known.min()) if known.size else 1.0
-
-
 def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
     """Limits a little wider than the values, and never empty."""
     # Equal limits have no range to take a share of.

@@ -301,8 +301,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for joint, value in zip(joints, values, strict=True)
     }
     intervals = [
-        # An open end is infinite at either side.
-        (what, known.get(what, math.nan), low if math.isfinite(low) else -math.inf, high)
+        (fit.names_with_si.get(what, what), known.get(what, math.nan), low, high)
         for what, (low, high) in fit.intervals.items()
     ]
     if intervals:
@@ -364,8 +363,9 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
         if fuzzy is None:
             continue
         heads = [f"{coefficient} = [{u}]" for coefficient, u in _units(run, name).items()]
+        found = {"name": name, "constant": fuzzy.constant, "along_motion": fuzzy.along_motion}
         if fuzzy.constant:
-            yield {"name": name, "constant": True}
+            yield found
             continue
         joints = []
         in_words = rules_in_words(model, run.comparison.joint_names)
@@ -392,12 +392,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
                 ),
                 "terms": Table(f"{head}: meaning of the words", columns, terms),
             })  # fmt: skip
-        yield {
-            "name": name,
-            "constant": False,
-            "along_motion": fuzzy.along_motion,
-            "joints": joints,
-        }
+        yield found | {"joints": joints}
 
 
 def _recording_table(run: Run) -> Table:

@@ -44,6 +44,7 @@ class FitRecord:
     warnings: tuple[str, ...] = ()
     unidentifiable: tuple[str, ...] = ()
     plant: dict[str, float] = field(default_factory=dict)  # adjusted terms by name
+    names_with_si: dict[str, str] = field(default_factory=dict)
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
     rule_seconds: tuple[tuple[float, ...], ...] = ()
 
@@ -51,7 +52,8 @@ class FitRecord:
     def of(cls, entry: dict[str, Any]) -> "FitRecord":
         """The record of a fit's entry."""
         known = {f.name: entry[f.name] for f in fields(cls) if f.name in entry}
-        ends = {name: (_number(a), _number(b)) for name, (a, b) in entry["intervals"].items()}
+        intervals = entry["intervals"].items()
+        ends = {name: (_number(a, -math.inf), _number(b)) for name, (a, b) in intervals}
         return cls(**known | {"intervals": ends, "residual": _number(entry["residual"])})
 
 
@@ -183,9 +185,9 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     )
 
 
-def _number(value: float | None) -> float:
+def _number(value: float | None, null: float = math.inf) -> float:
     """A number of JSON, where null is infinite."""
-    return math.inf if value is None else float(value)
+    return null if value is None else float(value)
 
 
 def _errors(of: dict[str, Any]) -> Errors:

@@ -4,17 +4,18 @@ import argparse
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from nfriction import CVFM, PendulumChain, cli, friction, rigs
 from nfriction.cli import inputs
 from nfriction.cli.console import Progress
 from nfriction.cli.tables import interval_table
 from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.model_file import save
 from tests.cli.benches import compare, pendulum, results
@@ -294,17 +295,20 @@ def test_progress_counts_stages_and_estimates_the_time_left(
 
 def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
     plant = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], armature=[0.01, 0.02])
-    names = "F_c of joint1", "inertia 22", "gravity 2", "armature 2", "length 1"
-    intervals = [Interval(name, 0.0, -0.1, 0.1) for name in names]
-    fit = SimpleNamespace(
-        plant=plant, model=CVFM(2), intervals=intervals, plant_terms=[("inertia 22", 0.0, 0.3)]
-    )
+    plant = plant.replace(armature=torch.tensor([0.01, 0.025]))
+    changes = {"inertia 22": 0.0, "gravity 2": 0.0, "armature 2": 0.25, "length 1": 0.1}
+    fit = FitResult(
+        CVFM(2), plant, tuple((name, x, 0.3) for name, x in changes.items()), "", True, 0.0, (), 0,
+        (), torch.zeros(0),
+        intervals=tuple(Interval(n, 0.0, -0.1, 0.1) for n in ("F_c of joint1", *changes)),
+    )  # fmt: skip
     said = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
     inertia, moment = float(plant.inertia_coupling[1, 1]), float(plant.gravity_moment[1])
     assert said == [
         "F_c of joint1",
-        f"inertia 22 ({inertia:.4g} kg m^2)",
-        f"gravity 2 ({moment:.4g} N m)",
-        "armature 2 (0.02 kg m^2)",
+        f"inertia 22 ({inertia:.4g} -> {inertia:.4g} kg m^2)",
+        f"gravity 2 ({moment:.4g} -> {moment:.4g} N m)",
+        "armature 2 (0.02 -> 0.025 kg m^2)",
         "length 1",
     ]
+    assert fit.to_dict()["names_with_si"]["armature 2"] == said[3]

@@ -1,13 +1,15 @@
 """Coefficients in figures are the models' own, and intervals those that the fit claims."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import ALFM, LFM, NCFM, NFLFM, Recording, fit, plots, rigs
+from nfriction import ALFM, LFM, NCFM, NFCVFM, NFLFM, Recording, fit, plots, rigs
 from nfriction.fitting.result.identifiability import Interval
+from nfriction.friction.models import FrictionModel
 from nfriction.signals import Motion
 
 
@@ -19,8 +21,15 @@ def motion() -> Motion:
     return Motion(time, q, qd, qdd)
 
 
+def varying(model: FrictionModel) -> FrictionModel:
+    """The same with other parameters, whose coefficients follow the motion."""
+    start = model.schedule.parameter_vector()
+    model.schedule.set_parameter_vector(start + 0.2 * torch.sin(torch.arange(1.0, len(start) + 1)))
+    return model
+
+
 def test_lines_are_the_coefficients_along_the_motion(motion):
-    models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": NFLFM(2, [1e-3, 2e-2])}
+    models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": varying(NFLFM(2, [1e-3, 2e-2]))}
     figure = plots.coefficients_over_time(models, motion, joint_names=["a", "b"])
     assert len(figure.axes) == 4
     qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
@@ -34,11 +43,37 @@ def test_lines_are_the_coefficients_along_the_motion(motion):
 
 
 def test_models_of_one_law_keep_their_colours_among_all(motion):
-    models = {"NCFM": NCFM(2), "LFM": LFM(2), "NFLFM": NFLFM(2)}
+    models = {"NCFM": NCFM(2), "LFM": LFM(2), "NFLFM": varying(NFLFM(2))}
     figure = plots.coefficients_over_time(models, motion, law=models["LFM"].law.name)
     looks = plots.style.looks(models)
     expected = [looks[name].line["color"] for name in ("LFM", "NFLFM")]
-    assert [line.get_color() for line in figure.axes[0].lines] == expected
+    lines = figure.axes[0].lines
+    assert [line.get_color() for line in lines] == expected
+    assert lines[1].get_linestyle() == "-"  # a network's, which may be steep
+
+
+def test_constant_coefficients_are_told_and_not_drawn(motion):
+    model = NFCVFM(2, [[8e-3, 2e-3], [5e-3, 0.3]], inputs=["heat"])
+    model.schedule.set_heat([2e-3, 4e-3], 60.0, 5e-3)
+    figure = plots.coefficients_over_time({"NFCVFM": model}, motion)
+    first, second = figure.axes
+    assert first.get_ylabel() == "$h$ [-]"
+    told = "constant:\n$F_\\mathrm{c}$ = %s\n$F_\\mathrm{v}$ = %s\n$k_\\mathrm{h}$ = 0"
+    assert first.get_title() == "joint1\n" + told % ("8 mN m", "2 mN m s/rad")
+    assert second.get_title() == "joint2\n" + told % ("5 mN m", "0.3 N m s/rad")
+    figure.draw_without_rendering()
+
+
+def test_a_figure_of_constants_alone_has_only_their_values(motion):
+    models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": NFLFM(2, [1e-3, 1e-2])}
+    figure = plots.coefficients_over_time(models, motion)
+    assert not any(ax.lines or ax.axison for ax in figure.axes)
+    told = "constant:\n$B$ = 2 / 1 mN m s/rad\n$C$ = 10 mN m"
+    assert [ax.get_title() for ax in figure.axes] == [f"joint{k}\n{told}" for k in (1, 2)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # such as of a layout without room for its text
+        figure.draw_without_rendering()
+        plots.coefficients_over_time({"NCFM": NCFM(2)}, motion).draw_without_rendering()
 
 
 def test_an_adaptive_model_switches_as_a_controller_does(motion):

@@ -33,6 +33,7 @@ def fit(**changes: Any) -> dict[str, Any]:
     found = {
         "status": "converged: A full step can lower the cost no more.", "converged": True,
         "residual": 1e-3, "residual_unit": "rad", "at_bounds": [], "plant": {"inertia 1": 0.02},
+        "names_with_si": {"inertia 1": f"inertia 1 (0.05 -> 0.051 kg m^2) {EVIL}"},
         "intervals": {"B of second": [1e-3, None], "inertia 1": [0.01, 0.03]},
         "unidentifiable": [], "warnings": [], "usability": ["good", ""],
     }  # fmt: skip

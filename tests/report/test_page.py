@@ -135,6 +135,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
         "2000.",
         "Fit of load-coulomb (LFM): good",
         "0.002 N m s/rad",
+        "inertia 1 (0.05 -> 0.051 kg m^2)",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
         "Doubtful.",
         "Not identifiable: f_a with f_v.",

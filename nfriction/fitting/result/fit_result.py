@@ -61,6 +61,11 @@ class InputGain:
         )
 
 
+# Plant terms that are relative changes, each of one buffer: its name and unit.
+_RELATIVE = {"inertia": ("inertia_coupling", "kg m^2"), "gravity": ("gravity_moment", "N m"),
+             "armature": ("armature", "kg m^2"), "mass": ("mass", "kg")}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class FitResult:
     """A fitted model and the quality of its fit.
@@ -208,6 +213,20 @@ class FitResult:
             return self.plant.unit
         return "N" if self.plant.unit == "m" else "N m"
 
+    def names_with_si(self) -> dict[str, str]:
+        """Names of relative plant terms, each with the value in SI as given and as fitted."""
+        named, buffers = {}, dict(self.plant.named_buffers())
+        for name, change, _ in self.plant_terms:
+            term, _, place = name.partition(" ")
+            if term in _RELATIVE:
+                buffer, unit = _RELATIVE[term]
+                values = buffers[buffer]
+                if values.ndim > 1:  # the inertia of link 2 is 22, on the diagonal
+                    values, place = values.diagonal(), place[len(place) // 2 :]
+                value = float(values[int(place) - 1])
+                named[name] = f"{name} ({value / (1 + change):.4g} -> {value:.4g} {unit})"
+        return named
+
     def rule_seconds(self) -> list[list[float]]:
         """Seconds for which the recordings fired each rule of a network, by joint."""
         rules = self.model.schedule.fuzzy_rules()
@@ -233,6 +252,7 @@ class FitResult:
             "residual_unit": self.residual_unit,
             "at_bounds": list(self.at_bounds),
             "plant": {name: value for name, value, _ in self.plant_terms},
+            "names_with_si": self.names_with_si(),
             "intervals": {
                 i.name: [x if math.isfinite(x) else None for x in (i.low, i.high)]
                 for i in self.intervals
