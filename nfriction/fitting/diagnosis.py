@@ -33,8 +33,6 @@ FEWEST_FOR_CURVATURE = 5
 FEWEST_BLOCKS = 20
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
-# Growth of friction that is named, relative to its mean; less hardly shows in a simulation.
-LEAST = 0.01
 
 
 @dataclass(frozen=True)
@@ -492,7 +490,8 @@ def changing_friction(
             found = [_growth(piece == k, *given) for k in range(pieces)]
             sd = math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
             constant, growing = torch.stack([squares for _, squares in found]).T
-            least = max(LEAST, sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2))
+            least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
+            least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
             if abs(rate) > least and gains(growing, constant, options.drift_chance):
                 # From start to end as if exponential, so that no friction falls by over 100 %.
                 sd *= np.exp(rate) * student_quantile(pieces - 1, 0.975)
