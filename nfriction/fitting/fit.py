@@ -88,7 +88,7 @@ def fit(
             error of each joint.
         fit_delay: also estimate the delay of torques relative to positions, such as a bus or a
             filter causes; one delay for all (`FitResult.torque_delay`, with an interval).
-        callback: called with a stage name after every step; True stops.
+        callback: `callback(stage, step)` after every step, a name and a `Step`; True stops.
 
     Returns:
         The fit; read `converged`, `status` and `warnings`.

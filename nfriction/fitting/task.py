@@ -54,7 +54,7 @@ class FitTask:
         motions: smoothed motion of each recording, in joint coordinates.
         options: settings of the fit.
         start: an earlier fit to start from.
-        callback: called with a stage name after every step; True stops.
+        callback: `callback(stage, step)` after every step, a name and a `Step`; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
         delay: of the torque after the positions from the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
