@@ -1,6 +1,6 @@
 """Candidates in parallel on a GPU: rolled out, and differentiated, in eager torch.
 
-Run from the repository's root: `python benchmarks/gpu.py [--candidates 10000 100000]`. Says so
+The peer is the compiled rollout on one thread of the processor. Run from the repository's root: `python benchmarks/gpu.py [--candidates 10000 100000]`. Says so
 where no GPU is present; `--device cpu` tries the same on the processor.
 """
 
@@ -44,6 +44,18 @@ def agreement(dtype: torch.dtype, device: torch.device, steps: int) -> float:
     return float((found.cpu().double() - expected).abs().max())
 
 
+def measure_compiled(count: int, steps: int, repeats: int) -> None:
+    plant, model = cases.rig(), cases.neurofuzzy().requires_grad_(False)
+    q0, qd0 = cases.release(count)
+
+    def forward() -> Tensor:
+        return rollout(plant, model, q0, qd0, steps=steps, gradients=False, backend="compiled").q
+
+    seconds, _ = timed(forward, torch.device("cpu"), repeats)
+    print(f"  {count:7,}  float64  {'one thread, compiled':21} {seconds:8.3f} s  "
+          f"{count * steps / seconds / 1e6:8.2f} M steps/s", flush=True)  # fmt: skip
+
+
 def measure(count: int, dtype: torch.dtype, device: torch.device, steps: int, repeats: int) -> None:
     plant, model = cases.rig().to(device, dtype), cases.neurofuzzy().to(device, dtype)
     q0, qd0 = (x.to(device, dtype) for x in cases.release(count))
@@ -77,6 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--device", default="cuda")
     options = parser.parse_args(argv)
+    torch.set_num_threads(1)
     device = torch.device(options.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         print("no GPU present (torch.cuda.is_available() is false): nothing measured")
@@ -84,6 +97,8 @@ def main(argv: list[str] | None = None) -> int:
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "the processor"
     print(f"neuro-fuzzy friction, three links, {options.steps} steps on {name}, "
           f"torch {torch.__version__}")  # fmt: skip
+    for count in options.candidates:
+        measure_compiled(count, options.steps, options.repeats)
     for dtype in (torch.float64, torch.float32):
         difference = agreement(dtype, device, options.steps)
         print(f"  {str(dtype)[6:]}: within {difference:.1e} rad of the processor's float64")
