@@ -131,6 +131,8 @@ def _fitter(
     terms = adjustable_terms(
         plant, task.recordings, options, eccentric=eccentric, per_recording=task.per_recording
     )
+    # A law of the transmitted torque has the losses of the gear itself.
+    terms = [t for t in terms if not (model.law.reads_drive and "gear_loss" in t.change)]
     sd = options.encoder_offset_sd
     shape = (len(task.recordings), plant.joints)
     return ShootingFitter(
