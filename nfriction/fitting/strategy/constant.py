@@ -30,11 +30,7 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.further_terms import delay_warning, richer_by_evidence
-from nfriction.fitting.strategy.presliding import (
-    TRAVELLED,
-    ambiguous_stiffness,
-    presliding_starts,
-)
+from nfriction.fitting.strategy.presliding import TRAVELLED, ambiguous_stiffness, presliding_starts
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -81,10 +77,8 @@ def fit_constant(task: FitTask) -> FitResult:
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
     friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    search = horizon_continuation(
-        fitter, friction, plant, task.motions,
-        None if linear else equation_error,
-    )  # fmt: skip
+    other_starts = None if linear else equation_error
+    search = horizon_continuation(fitter, friction, plant, task.motions, other_starts)
     # A nonlinear law may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
@@ -186,8 +180,7 @@ def warm_start_from_nested(
         start: parameters of the nested law, and of the plant.
         motions, equation_error: see `horizon_continuation`.
     """
-    stages = f", {nested.friction.law.name} law"
-    base = horizon_continuation(nested, *start, motions, of=stages)
+    base = horizon_continuation(nested, *start, motions, of=f", {nested.friction.law.name} law")
     best = best_of_starts(fitter, own.end, base.end, equation_error)
     if best.problem is own.end.problem:
         return own.ending(best)
