@@ -12,7 +12,8 @@ import pandas as pd
 
 from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
-from nfriction.fitting.data.inputs import as_model, require_drive, warn_of_undriven
+from nfriction.fitting.data.inputs import as_model, finer_counts, require_drive, warn_of_undriven
+from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
@@ -20,7 +21,7 @@ from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
-from nfriction.signals import Motion, kalman_smoother
+from nfriction.signals import kalman_smoother
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -168,13 +169,12 @@ class Comparison:
             for s in self.scores(part)[self.nearest(part)]
             if s.limit is not None
         ]
+        columns = (*self.joint_names, "all")
         rows = [
             (model, s.recording, part, horizon, joint, value)
             for model, s, part in (*scores, *limits)
             for horizon, rmse in (("free run", s.free_run), *s.windows.items())
-            for joint, value in zip(
-                (*self.joint_names, "all"), (*rmse.joints, rmse.all), strict=True
-            )
+            for joint, value in zip(columns, (*rmse.joints, rmse.all), strict=True)
         ]
         keys = ["model", "recording", "part", "horizon", "joint"]
         return pd.DataFrame(rows, columns=[*keys, f"rmse [{self.unit}]"])
@@ -299,11 +299,9 @@ class Comparison:
                 part: {s.recording: s.to_dict() for s in getattr(self, part).get(name, [])}
                 for part in PART_NAMES
             }
-            if name in self.fits:
-                fit = self.fits[name]
-                models[name] |= {
-                    "coefficients": coefficient_summary(fit.model), "fit": fit.to_dict()
-                }  # fmt: skip
+            if fit := self.fits.get(name):
+                models[name]["coefficients"] = coefficient_summary(fit.model)
+                models[name]["fit"] = fit.to_dict()
         best, judged = self.best(), None
         if best is not None:
             judged = {
@@ -373,14 +371,17 @@ def compare(
         require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
-    joint = [recording.joint_coordinates(plant) for recording in train]
     progress.expect(1 + len(set(map(model_name, models))), brief=True)  # scores, besides fits
     # Smoothed once for all fits.
-    data = Data(train, [kalman_smoother(r.time, r.q) for r in joint])
-    _warn_of_faster(plant, data.motions, test)
+    data, tested = (
+        Data(part, [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in part])
+        for part in (train, test)
+    )
+    _warn_of_faster(plant, data, tested)
     fits, failed = fit_models(
         plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
     )["fit"]
+    _warn_of_mistakes(plant, next(iter(fits.values())), data, tested)
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
@@ -393,8 +394,7 @@ def compare(
                     score(
                         found.plant if found else plant, found.model if found else None,
                         found.aligned(recording) if found else recording,
-                        initial_state=states.get(recording.name), horizons=horizons,
-                        zeroed=zeroed,
+                        initial_state=states.get(recording.name), horizons=horizons, zeroed=zeroed,
                     )
                     for recording in recordings
                 ]  # fmt: skip
@@ -405,12 +405,22 @@ def compare(
     )  # fmt: skip
 
 
-def _warn_of_faster(plant: Plant, trained: Sequence[Motion], test: Sequence[Recording]) -> None:
+def _warn_of_mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> None:
+    """Warn of likely mistakes in test recordings, unless the fit names some in its own."""
+    known, both = {*finer_counts(plant, train.recordings)}, [*train.recordings, *test.recordings]
+    found = [told for told in finer_counts(plant, both) if told not in known]
+    for recording, moved in () if fit.mistakes else zip(*test, strict=True):
+        joint = fit.aligned(recording.joint_coordinates(plant))
+        mistakes = likely_mistakes(plant, [joint], [moved], recording.resolve_convention(plant))
+        found += [f"{recording.name or 'test'}: {told}" for told in mistake_warning(*mistakes)]
+    for told in found:
+        warnings.warn(told, stacklevel=1)
+
+
+def _warn_of_faster(plant: Plant, train: Data, test: Data) -> None:
     """Warn of test recordings faster than all training recordings: friction is extrapolated."""
-    fastest, found = np.max([np.abs(m.qd).max(0) for m in trained], axis=0), []
-    for recording in test:
-        joint = recording.joint_coordinates(plant)
-        moved = kalman_smoother(joint.time, joint.q)
+    fastest, found = np.max([np.abs(m.qd).max(0) for m in train.motions], axis=0), []
+    for recording, moved in zip(*test, strict=True):
         # Pure noise exceeds other pure noise in half of all cases.
         noise = 0.0 if moved.std is None else 2.0 * moved.std.qd
         speeds = np.quantile(np.abs(moved.qd) - noise, 1.0 - FASTER, axis=0)

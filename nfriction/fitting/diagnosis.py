@@ -278,9 +278,8 @@ def _corrected_positions(
     ) -> _Data:
         """The data if recorded positions were `matrix @ q + offset` in the convention `reading`."""
         if not chain:
-            return replace(given, q=given.q @ torch.as_tensor(matrix.T),
-                           qd=given.qd @ torch.as_tensor(matrix.T),
-                           qdd=given.qdd @ torch.as_tensor(matrix.T))  # fmt: skip
+            turn = torch.as_tensor(matrix.T)
+            return replace(given, q=given.q @ turn, qd=given.qd @ turn, qdd=given.qdd @ turn)
         q = convention.position_from_joint(given.q.numpy(), first) @ matrix.T + offset
         given_rates = given.qd.numpy(), given.qdd.numpy()
         rates = (convention.rate_from_joint(x, first) @ matrix.T for x in given_rates)
@@ -290,13 +289,12 @@ def _corrected_positions(
         )
 
     for j, name in enumerate(names):
-        scale = eye.copy()
-        for factor in (-1.0, 0.25, 0.5, 2.0, 4.0):
-            scale[j, j] = factor
-            # The counts of an encoder's revolution, in quadrature or not.
-            large = f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
-            text = f"the sign of {name}'s position is reversed" if factor < 0 else large
-            yield text, recorded(scale)
+        own = np.diag(eye[j])
+        yield f"the sign of {name}'s position is reversed", recorded(eye - 2 * own)
+        # The counts of an encoder's revolution, in quadrature or not.
+        for factor in (0.25, 0.5, 2.0, 4.0):
+            text = f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
+            yield text, recorded(eye + (factor - 1) * own)
         # A half turn of the first link is a matter of the convention.
         turns = (-90, 90) if j == first else (-90, 90, 180)
         for degrees in turns if chain and j >= first else ():
@@ -621,10 +619,8 @@ def _drifting_clock(
         lambda x: _unexplained(plant, _collect(recordings, motions, options, drift=x)), -most, most
     )
     fast = "faster" if drift > 0 else "slower"
-    return (
-        f"the clock of the torques is {100 * abs(drift):.2g} % {fast} than that of the positions",
-        share,
-    )
+    off = f"{100 * abs(drift):.2g} % {fast}"
+    return f"the clock of the torques is {off} than that of the positions", share
 
 
 def _best(

@@ -102,7 +102,7 @@ class FitOptions:
     # Bias of a current sensor over the largest torque; the prior is narrow because, with dry
     # friction, an offset and a wrong zero of an angle are nearly equivalent.
     offset_term: tuple[float, float] = (0.3, 0.01)
-    # Asymmetry of a guide over the ratio of the largest force to the largest speed.
+    # Of an axis: constant force over the largest, asymmetry over that at the largest speed.
     asymmetry_term: tuple[float, float] = (1.0, 0.1)
     # Drag of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
     drag_term: tuple[float, float] = (1.0, 0.05)

@@ -55,13 +55,14 @@ def plant_parameters(
         unit = _at(buffers, "gear_loss", j)
         found.append(_amount(buffers, f"gear loss {j + 1}", unit, options.loss_term))
     kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
-    bound, sd = (share * largest_torque for share in options.offset_term)
+    # The bias of a sensor; the drive of an inclined axis also holds its weight.
+    shares = options.asymmetry_term if plant.unit == "m" else options.offset_term
+    bound, sd = (share * largest_torque for share in shares)
     for j in driven:
         unit = _at(buffers, "torque_offset", j)
         found.append(PlantParameter(f"{kind} offset {j + 1} [{force}]", unit, -bound, bound, sd))
     if driven and "asymmetry" in buffers and largest_rate > 0:
-        scale = largest_torque / largest_rate
-        bound, sd = (share * scale for share in options.asymmetry_term)
+        bound, sd = (share * largest_torque / largest_rate for share in options.asymmetry_term)
         unit = {"asymmetry": torch.ones_like(buffers["asymmetry"])}
         found.append(PlantParameter("asymmetry [N s/m]", unit, -bound, bound, sd))
     if drag:
@@ -99,11 +100,9 @@ def _chain_terms(
         return _at(buffers, "inertia_coupling", *pairs, *((j, i) for i, j in pairs))
 
     weight = has_weight(buffers["gravity_moment"], buffers["inertia_coupling"])
-    for i in range(links):
-        # Without torque and gravity, the inertia only sets the scale of the friction.
-        if driven or weight:
-            name = f"inertia {i + 1}{i + 1}"
-            yield from _ratio(buffers, name, coupled((i, i)), options.ratio_term)
+    # Without torque and gravity, the inertia only sets the scale of the friction.
+    for i in range(links) if driven or weight else ():
+        yield from _ratio(buffers, f"inertia {i + 1}{i + 1}", coupled((i, i)), options.ratio_term)
     # The off-diagonal inertia a_ij = L_i b_j shares the first moment b_j with gravity, so both
     # scale together.
     for j in range(0 if driven and weight else 1, links):

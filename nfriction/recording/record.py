@@ -262,8 +262,8 @@ class Recording:
             table: one row per sample.
             columns: the table's names for ours, optionally with a unit after a colon,
                 {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg, rev,
-                counts/8192 (any number per revolution), m, mm; these per second, rpm; N m, mN m,
-                N, mN; A, mA.
+                counts/8192 (any number per revolution), m, cm, mm, um; these per second, rpm;
+                N m, mN m, N cm, N, mN, kN; A, mA; min. One in the name, "angle [deg]", is read.
             degrees: positions and velocities without a unit are in degrees.
             convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
                 `AngleConvention`, or a plant; by default `table.attrs["convention"]`, or None for

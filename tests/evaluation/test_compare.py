@@ -156,6 +156,20 @@ def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
         compare(pendulum(), "NCFM", B, A, **settings)
 
 
+def test_a_mistake_in_a_test_recording_is_named(recwarn):
+    settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
+    compare(pendulum(), "NCFM", A, B, **settings)
+    assert not [w for w in recwarn if "likely" in str(w.message) or "unit" in str(w.message)]
+    off = dataclasses.replace(B, q=B.q + np.array([0.0, np.pi / 2]))
+    with pytest.warns(
+        UserWarning, match=r"b: A mistake .* likely: joint2's position is 90 degrees"
+    ):
+        compare(pendulum(), "NCFM", A, off, **settings)
+    small = dataclasses.replace(B, q=np.deg2rad(B.q))
+    with pytest.warns(UserWarning, match=r"joint1 changes by 1.34e-05 rad in b, by at least"):
+        compare(pendulum(), "NCFM", A, small, **settings)
+
+
 def test_noise_at_rest_is_no_faster_motion(recwarn):
     rng = np.random.default_rng(0)
     still = [

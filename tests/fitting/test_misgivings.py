@@ -1,5 +1,7 @@
 """What looks wrong about a recording is said, and of a sound one nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,20 @@ def test_a_count_larger_than_the_positions_show_is_named(factor, named):
     told = said(pendulum(position_quantum=factor * COUNT), recording)
     assert any("less than the `position_quantum` of 0.00307" in t for t in told) is named
     assert len(told) == named
+
+
+def test_a_count_unlike_that_of_other_recordings_is_named():
+    first = swing(pendulum(), MODEL, seconds=1.0)
+    # The second joint rests, and shows no count.
+    still = replace(first, q=first.q * [1.0, 0.0], name="still")
+    assert not any("changes by" in told for told in said(pendulum(), first, still))
+    degrees = replace(first, q=np.deg2rad(first.q), name="degrees")
+    told = said(pendulum(), first, degrees)
+    assert [text.split(", with")[0] for text in told if "wrong unit" in text] == [
+        f"joint{j} changes by 1.34e-05 rad in degrees, by at least 0.000767 in another: with the "
+        "same encoder one of the two is in a wrong unit; read each recording with its own."
+        for j in (1, 2)
+    ]
 
 
 def test_a_joint_that_moves_in_one_recording_is_not_named():

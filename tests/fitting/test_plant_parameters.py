@@ -1,12 +1,14 @@
 """Adjustable plant terms: what data can tell, ratios and offsets within bounds."""
 
+import numpy as np
 import pytest
 import torch
 
-from nfriction import LinearAxis, PendulumChain, Rotor, rigs
+from nfriction import CVFM, LinearAxis, PendulumChain, Recording, Rotor, fit, rigs, rollout
 from nfriction.fitting.adjusted_plant import adjusted_buffers
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum
 
 
@@ -72,6 +74,21 @@ def test_terms_that_are_not_there_are_not_adjusted():
     assert names(LinearAxis(2.0), driven=()) == []
     moved = names(LinearAxis(2.0), driven=(0,), largest_torque=1.0, largest_rate=0.1)
     assert moved[-1] == "asymmetry [N s/m]"
+
+
+def test_the_drive_of_an_axis_may_hold_its_weight():
+    """A vertical axis needs a constant force far above the bias of a sensor."""
+    time = np.arange(1500) * 2e-3
+    drive = 20.0 + 4.0 * np.cos(9 * time) + 2.0 * np.cos(23 * time)
+    vertical, zero = LinearAxis(2.0, torque_offset=-20.0), torch.zeros(1, dtype=F64)
+    truth = CVFM(1, [[1.0, 3.0]]).requires_grad_(False)
+    run = rollout(vertical, truth, zero, zero, torch.tensor(drive[:-1, None]), sample_time=2e-3)
+    recording = Recording(time, quantise(run.q.numpy(), 2**18), tau=drive[:, None], unit="m")
+    found = fit("CVFM", LinearAxis(2.0), recording, windows=(0.3,))
+    assert not found.at_bounds
+    known = {name: value for name, value, _ in found.plant_terms}
+    assert known["force offset 1 [N]"] == pytest.approx(-20.0, rel=0.01)
+    assert found.model.schedule.values[0].tolist() == pytest.approx([1.0, 3.0], rel=0.05)
 
 
 def test_an_arm_has_no_hanging_position_and_no_encoder_terms():

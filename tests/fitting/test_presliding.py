@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import FitResult, LinearAxis, Plant, Recording, fit, rollout
+from nfriction import FitResult, LinearAxis, Plant, Recording, Rotor, fit, rollout
 from nfriction.evaluation.compare import Comparison, compare
 from nfriction.evaluation.results import write_results
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.constant import _fitter
 from nfriction.fitting.strategy.presliding import yielding
+from nfriction.fitting.task import prepare_task, regression
 from nfriction.friction import model_by_name
 from nfriction.friction.memory import DAHL, Dahl, Gear, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
@@ -244,6 +247,18 @@ def test_gear_loss_is_found_in_both_directions_of_the_power() -> None:
         score(f.plant, f.model, apart, limit=False).windows["1"].all for f in (found, dahl)
     )
     assert gear < 0.2 * other
+
+
+def test_a_law_of_gears_leaves_the_plant_none_of_their_loss() -> None:
+    """Only the sum of both losses is determined, so that the law's would be pulled to zero."""
+    recording = pushed(Gear(1, (0.4, 0.1, 0.1, 0.3, 400.0)).requires_grad_(False), 3,
+                       seconds=2.0, rate=100)._replace(unit="rad")  # fmt: skip
+    names = []
+    for law in ("gear", "viscous"):
+        task = prepare_task(law, Rotor(inertia=0.5), recording, FitOptions())
+        fitter = _fitter(task, task.model, regression(task, task.model, task.plant), False)
+        names.append([term.name for term in fitter.jacobian.terms])
+    assert [any("gear loss" in name for name in of) for of in names] == [False, True]
 
 
 @pytest.mark.slow

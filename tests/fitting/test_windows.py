@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import Recording
+from nfriction import CVFM, PendulumChain, Recording, fit, rollout
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.signals import Motion
+from nfriction.signals import Motion, quantise
 
 
 def made(samples, seed=0, tau=False):
@@ -40,6 +40,36 @@ def test_windows_cover_the_recording_without_gaps(length):
     assert span == pytest.approx(recording.duration)
     if length < span:
         assert span / len(w) == pytest.approx(length, rel=0.35)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_the_rest_in_which_a_recording_ends_is_in_no_window(noise):
+    time = np.arange(500) * 0.01
+    away = np.where(time < 3.0, np.cos(7 * time), np.cos(21.0))
+    smooth = np.stack([away, 0.3 + 0 * time], 1)
+    read = smooth + noise * np.random.default_rng(0).normal(size=smooth.shape)
+    rest = np.arange(500) >= 300
+    for moving, last in ((smooth, 300), (smooth[rest], 199)):
+        at = slice(500 - len(moving), None)
+        recording, motion = Recording(time[at], read[at]), Motion(time[at], moving, moving, moving)
+        w = cut_windows([recording], [motion], 0.5)
+        # All of a recording without any motion, whose joints are named elsewhere.
+        assert w.spans[-1][2] == pytest.approx(last, abs=2)
+
+
+def test_rest_away_from_the_equilibrium_does_not_bias_the_friction():
+    """It creeps under a smoothed sign, which more friction would lessen."""
+    plant = PendulumChain([0.5], [0.4], com=[0.2], inertia=[0.004])
+    truth = CVFM(1, [[0.04, 0.0008]]).requires_grad_(False)
+    recordings = []
+    for angle in (2.3, -2.05):
+        q0 = torch.tensor([np.pi + angle], dtype=torch.float64)
+        run = rollout(plant, truth, q0, 0 * q0, sample_time=5e-3, steps=2200, substeps=4,
+                      scheme="time_stepping")  # fmt: skip
+        recordings.append(Recording(run.time.numpy(), quantise(run.q.numpy(), 4096)))
+    found = fit("CVFM", plant, recordings, windows=(0.3,), drag=False, fit_plant=False)
+    for interval, true in zip(found.intervals, (0.04, 0.0008), strict=True):
+        assert interval.low < true < interval.high
 
 
 def test_a_subset_keeps_what_belongs_to_its_windows():

@@ -292,6 +292,19 @@ def test_mappings_that_lead_nowhere_are_named(
         read(tmp_path, "time,enc\n" + "".join(f"{k},0\n" for k in range(9)), columns=columns)
 
 
+def test_a_unit_in_brackets_that_is_not_known_is_told(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    text = written(",", False, "time{0}angle [gon]{0}joint[2]")
+    columns = {"q1": "angle [gon]", "q2": "joint[2]"}
+    with pytest.warns(RecordingWarning, match=r"angle \[gon\]: 'gon' is not a known unit") as said:
+        assert np.array_equal(read(tmp_path, text, columns=columns).q, Q)
+    assert not [w for w in said if "joint[2]" in str(w.message)]  # an index
+    recwarn.clear()
+    read(tmp_path, text, columns=columns | {"q1": "angle [gon]:mrad"})
+    assert not [w for w in recwarn if "gon" in str(w.message)]
+
+
 def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
     text = written(",", False, "time [s]{0}q1 [rad]{0}q2 [rad]")
     with pytest.raises(ValueError, match=r"`degrees=True`, but column q1 \[rad\]"):

@@ -28,6 +28,10 @@ from nfriction.io.formats.selection import is_unit, slides, to_si
         ("tau", "N mm", 1e-3),
         ("tau", "Ncm", 1e-2),
         ("tau", "kN", 1e3),
+        ("time", "min", 60.0),
+        ("q", "turns", 2 * math.pi),
+        ("q", "[µm]", 1e-6),
+        ("qd", "cm/s", 1e-2),
         ("tau", "N m", 1.0),
     ],
 )
@@ -53,5 +57,5 @@ def test_a_unit_of_another_kind_is_refused(kind: str, unit: str) -> None:
 
 
 def test_lengths_are_told_from_angles() -> None:
-    assert [u for u in ("m", "mm", "[mm]", "deg", "rad", "counts/4") if slides(u)] == [
-        "m", "mm", "[mm]"]  # fmt: skip
+    assert [u for u in ("m", "cm", "um", "[mm]", "deg", "rad", "counts/4") if slides(u)] == [
+        "m", "cm", "um", "[mm]"]  # fmt: skip

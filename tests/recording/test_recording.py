@@ -136,11 +136,27 @@ def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
         assert np.array_equal(found.tau[:, 1], recording.tau[:, 1])
 
 
+def test_a_unit_in_the_name_of_a_column_holds_in_every_table() -> None:
+    recording = swing(joints=1)
+    names = {"time": "t [ms]", "q1": "angle [deg]", "tau1": "torque_Ncm", "qd1": "speed (deg/s)"}
+    table = recording.to_pandas() * {
+        "time": 1e3,
+        "q1": 180 / np.pi,
+        "tau1": 1e2,
+        "qd1": 180 / np.pi,
+    }
+    back = Recording.from_pandas(table.rename(columns=names), columns=names)
+    for found, given in ((back.q, recording.q), (back.tau, recording.tau), (back.qd, recording.qd)):
+        np.testing.assert_allclose(found, given, rtol=1e-14)
+    np.testing.assert_allclose(back.time, recording.time, rtol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("name", "joints", "own"),
     [
         ("tau", 1, "tau1"), ("tau", 2, "tau1"), ("Tau1", 1, "tau1"), ("tau_2", 2, "tau2"),
         ("torque1", 2, "tau1"), ("motorTorque2 [Nm]", 2, "tau2"), ("tau0", 1, "tau1"),
+        ("tau1_Ncm", 1, "tau1"), ("torque_2_Nm", 2, "tau2"),
     ],
 )  # fmt: skip
 def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(

@@ -114,10 +114,9 @@ def as_recording_list(
 def _refuse_repeated(recordings: Sequence[Recording]) -> None:
     """Refuse the same data twice, under any name, because that would narrow intervals."""
     first: dict[str, int] = {}
-    for k, recording in enumerate(recordings):
-        # Several blocks of a recording may contain the same rest.
-        if not np.ptp(recording.q, axis=0).any():
-            continue
+    # Several blocks of a recording may contain the same rest.
+    moving = [(k, r) for k, r in enumerate(recordings) if np.ptp(r.q, axis=0).any()]
+    for k, recording in moving:
         before = first.setdefault(recording.digest(), k)
         if before != k:
             names = (recordings[before].name or "unnamed", recording.name or "unnamed")
@@ -306,15 +305,12 @@ def looks_zeroed_per_recording(
     Dry friction holds links wherever they stop. If a driven chain begins several recordings at rest
     and all its encoders read zero each time, they must have been set to zero.
     """
-    return (
-        weighs(plant)
-        and bool(largest_torques(recordings).any())
-        and len(recordings) > 1
-        and all(
-            begins_at_rest(r, options.rest_speed) and np.abs(r.q[0]).max() <= options.zero_reading
-            for r in recordings
-        )
+    driven = weighs(plant) and bool(largest_torques(recordings).any())
+    at_zero = (
+        begins_at_rest(r, options.rest_speed) and np.abs(r.q[0]).max() <= options.zero_reading
+        for r in recordings
     )
+    return driven and len(recordings) > 1 and all(at_zero)
 
 
 def data_warnings(
@@ -327,18 +323,26 @@ def data_warnings(
     """Warnings about recordings as given and in joint coordinates, one sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *_finer_count(plant, given)
+    of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *finer_counts(plant, given)
     return (*of_logs, *still, *heavy)
 
 
-def _finer_count(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
-    """Positions that change by less than the rig's encoder count."""
-    seen = float(np.fmax.reduce([count_seen(r.q) for r in given], axis=None))
-    # The usual factors are at least 2: both edges of a pulse, quadrature, a gear.
+def finer_counts(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
+    """Positions that change by less than the encoder count of the rig or of other recordings."""
+    counts = np.array([count_seen(r.q) for r in given])
+    coarsest = np.fmax.reduce(counts)
+    seen = float(np.fmax.reduce(coarsest))
+    # The usual factors are at least 2: both edges of a pulse, quadrature, a gear, a unit.
     if plant.position_quantum is not None and 1.5 * seen < plant.position_quantum:
         yield (
             f"Positions change by {seen:.3g} {plant.unit}, less than the `position_quantum` of "
             f"{plant.position_quantum:.3g}; give one count as motion of the joint, after any gear."
+        )
+    for k, j in np.argwhere(1.5 * counts < coarsest):
+        yield (
+            f"{plant.joint_names[j]} changes by {counts[k, j]:.3g} {plant.unit} in "
+            f"{given[k].name or 'a recording'}, by at least {coarsest[j]:.3g} in another: with the "
+            "same encoder one of the two is in a wrong unit; read each recording with its own."
         )
 
 
@@ -363,11 +367,9 @@ def _ranges(joint: Sequence[Recording]) -> Array:
 def _still_joints(
     plant: Plant, given: Sequence[Recording], joint: Sequence[Recording], min_counts: int
 ) -> Iterator[str]:
-    if plant.position_quantum is None:
-        # A joint without a visible count is not compared with one.
-        count = np.fmin.reduce([count_seen(r.q) for r in given])
-    else:
-        count = np.full(plant.joints, plant.position_quantum)
+    # A joint without a visible count is not compared with one.
+    seen, known = np.fmin.reduce([count_seen(r.q) for r in given]), plant.position_quantum
+    count = seen if known is None else np.full(plant.joints, known)
     for name, extent, one in zip(plant.joint_names, _ranges(joint), count, strict=True):
         if extent == 0:
             yield f"{name} never moves: its friction is not observable."
@@ -411,8 +413,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         height = np.minimum(np.abs(at - before), np.abs(at - after))
         height = np.where(2 * np.abs(after - before) <= height, height, 0.0)
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        columns = zip(recording.names, far.T, lasting.T, height.T, strict=True)
-        for name, peak, jump, high in columns:
+        for name, peak, jump, high in zip(recording.names, far.T, lasting.T, height.T, strict=True):
             of = f"{recording.name or 'A recording'}: {name} jumps"
             if peak.any():
                 yield (
@@ -421,10 +422,8 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 )
             if not jump.any():
                 continue
-            cause, remedy = (
-                "samples are missing there without a gap in time, or the encoder lost counts",
-                "give samples their own times, or cut the recording there",
-            )
+            cause = "samples are missing there without a gap in time, or the encoder lost counts"
+            remedy = "give samples their own times, or cut the recording there"
             # Two jumps by the same amount are not chance.
             if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"

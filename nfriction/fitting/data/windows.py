@@ -110,9 +110,8 @@ class Windows:
             # Over one sample, because interpolation has kinks at the samples.
             half = 0.5 * recording.sample_time
             at = recording.time[first:last] + delay
-            now, ahead, behind = (
-                torch.as_tensor(recording.torque_at(at + shift)) for shift in (0.0, half, -half)
-            )
+            around = (recording.torque_at(at + shift) for shift in (0.0, half, -half))
+            now, ahead, behind = map(torch.as_tensor, around)
             tau[w, : last - first] = now
             slope[w, : last - first] = (ahead - behind) / (2 * half)
         return tau, slope
@@ -125,7 +124,7 @@ def cut_windows(
     *,
     rest_speed: float | None = None,
 ) -> Windows:
-    """Cut recordings into windows of about `length` seconds that cover all but their gaps.
+    """Cut recordings into windows of about `length` seconds that cover all but gaps and final rest.
 
     Args:
         recordings, motions: in joint coordinates; a recording shorter than `length` is one window.
@@ -141,7 +140,7 @@ def cut_windows(
     spans = [
         (place, first, last)
         for place, recording in enumerate(recordings)
-        for first, last in _cut(recording, length)
+        for first, last in _cut(recording, motions[place], length)
     ]
     steps = max(last - first for _, first, last in spans)
     joints = recordings[0].q.shape[1]
@@ -171,9 +170,21 @@ def cut_windows(
     )  # fmt: skip
 
 
-def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
-    """First and last sample of each window."""
+def moving_segments(recording: Recording, motion: Motion) -> Iterator[tuple[int, int]]:
+    """First and last sample of each segment between gaps, without the rest in which it ends.
+
+    There dry friction may have any value up to breakaway, and a smoothed sign creeps instead.
+    """
+    # Three standard deviations of a reading.
+    noise = 3 * np.std(recording.q - motion.q, axis=0)
     for first, last in recording.segments:
+        away = (np.abs(motion.q[first:last] - motion.q[last]) > noise).any(axis=1).nonzero()[0]
+        yield first, (first + 1 + int(away[-1]) if len(away) else last)
+
+
+def _cut(recording: Recording, motion: Motion, length: float) -> Iterator[tuple[int, int]]:
+    """First and last sample of each window."""
+    for first, last in moving_segments(recording, motion):
         duration = recording.time[last] - recording.time[first]
         # Windows of equal length, since a short remainder would hardly determine its initial state.
         count = max(1, int(duration / length + 0.5))

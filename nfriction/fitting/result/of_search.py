@@ -190,7 +190,7 @@ def offset_warnings(
     for one in (i for i in intervals if i.name in terms and i.low * i.high > 0):
         ((buffer, chosen),) = terms[one.name].change.items()
         constant, j = buffer == "torque_offset", int(chosen.argmax())
-        if abs(one.value) > terms[one.name].prior_sd * (1 if constant else usual):
+        if abs(one.value) > terms[one.name].prior_sd * (usual if slides or not constant else 1):
             # An asymmetry is on the side of the friction.
             whole = float(dict(plant.named_buffers())[buffer][j]) * (1 if constant else -1)
             kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")

@@ -77,10 +77,8 @@ def fit_constant(task: FitTask) -> FitResult:
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
     friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    search = horizon_continuation(
-        fitter, friction, plant, task.motions,
-        None if linear else equation_error,
-    )  # fmt: skip
+    other_starts = None if linear else equation_error
+    search = horizon_continuation(fitter, friction, plant, task.motions, other_starts)
     # A nonlinear law may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
@@ -127,6 +125,8 @@ def _fitter(
     terms = adjustable_terms(
         plant, task.recordings, options, eccentric=eccentric, per_recording=task.per_recording
     )
+    # A law of the transmitted torque has the losses of the gear itself.
+    terms = [t for t in terms if not (model.law.reads_drive and "gear_loss" in t.change)]
     sd = options.encoder_offset_sd
     shape = (len(task.recordings), plant.joints)
     return ShootingFitter(
@@ -180,8 +180,7 @@ def warm_start_from_nested(
         start: parameters of the nested law, and of the plant.
         motions, equation_error: see `horizon_continuation`.
     """
-    stages = f", {nested.friction.law.name} law"
-    base = horizon_continuation(nested, *start, motions, of=stages)
+    base = horizon_continuation(nested, *start, motions, of=f", {nested.friction.law.name} law")
     best = best_of_starts(fitter, own.end, base.end, equation_error)
     if best.problem is own.end.problem:
         return own.ending(best)

@@ -116,14 +116,11 @@ class ShootingFitter:
         self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
     ) -> ShootingProblem:
         """The shooting problem of windows, started from these friction parameters."""
-        model = model_at(self.friction, friction)
+        model, plant = model_at(self.friction, friction), self.jacobian.plant
         longest_step = max(r.longest_step for r in self.recordings)
         return ShootingProblem(
-            self.jacobian, model, windows.with_states(self.jacobian.plant, model), noise,
-            self.measurement,
-            substeps=integration_substeps(
-                self.jacobian.plant, model, longest_step, self.options
-            ),
+            self.jacobian, model, windows.with_states(plant, model), noise, self.measurement,
+            substeps=integration_substeps(plant, model, longest_step, self.options),
             stride=stride, friction_prior=self.friction_prior, plant_prior=self.plant_prior,
             offset_sd=self.offset_sd, extrapolation=self.extrapolation, options=self.options,
         )  # fmt: skip
@@ -138,11 +135,9 @@ class ShootingFitter:
         """
         options, x = self.options, start
         solver = LevenbergMarquardt(
-            max_steps=options.max_steps,
-            gradient_tolerance=options.gradient_tolerance,
-            cost_tolerance=tolerance,
-            step_tolerance=options.step_tolerance,
-        )
+            max_steps=options.max_steps, gradient_tolerance=options.gradient_tolerance,
+            cost_tolerance=tolerance, step_tolerance=options.step_tolerance,
+        )  # fmt: skip
         lower, upper = problem.variables.bounds()
 
         def report(x: Tensor, local: Quadratic, step: Step) -> Status | None:
@@ -261,8 +256,7 @@ def horizon_continuation(
     offsets: Tensor | None = None
     noise, simulated = options.first_noise, motions
     for place, length in enumerate(options.windows):
-        rest = tuple(options.windows[place:])
-        last = len(rest) == 1
+        rest, last = tuple(options.windows[place:]), place + 1 == len(options.windows)
         problem = fitter.problem(fitter.cut(simulated, length), noise, friction)
         start = problem.variables.start(plant, offsets)
         if stages:
@@ -410,8 +404,7 @@ def restart_from_equation_error(
     initial values, are tried only if the encoder's rounding does not explain the residual; if it
     does, there is no lower minimum.
     """
-    problem, plant = found.problem, found.parts.plant
-    best = found
+    problem, plant, best = found.problem, found.parts.plant, found
     for place, friction in enumerate(equation_error(problem.plant_at(plant))):
         if place and best.explained:
             break

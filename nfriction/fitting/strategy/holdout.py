@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.windows import Windows, cut_windows
+from nfriction.fitting.data.windows import Windows, cut_windows, moving_segments
 from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
@@ -32,8 +32,7 @@ def cut_for_folds(
     if len(cut) >= folds:
         return cut
     # No window spans a gap, so the longest segment between gaps has to provide the windows.
-    longest = max(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
-    return cut_windows(joint, motions, longest / folds)
+    return cut_windows(joint, motions, max(_durations(joint, motions)) / folds)
 
 
 def holdout_windows(
@@ -44,8 +43,13 @@ def holdout_windows(
     Each then lies between training windows of similar motion; otherwise the largest third of a
     decaying swing, for example, would be tested with what was learned from the smaller swings.
     """
-    total = sum(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
+    total = sum(_durations(joint, motions))
     return cut_for_folds(joint, motions, min(length, total / folds**2), folds)
+
+
+def _durations(joint: Sequence[Recording], motions: Sequence[Motion]) -> list[float]:
+    pairs = [(r, s) for r, m in zip(joint, motions, strict=True) for s in moving_segments(r, m)]
+    return [float(r.time[last] - r.time[first]) for r, (first, last) in pairs]
 
 
 def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]]:

@@ -24,7 +24,7 @@ _OF_MOTORS = {"motor": "q", "current": "tau"}
 # Usual names of a torque, or of the current that produces it, followed by a number and a unit;
 # "torque_on" and "taut" are not among them.
 _LIKE_TORQUE = re.compile(
-    r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
+    r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*(_[mk]?(Nc?m?m?|A))?\s*([\[(].*)?$",
     re.IGNORECASE,
 )
 _LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)(?![a-z])", re.IGNORECASE)
@@ -36,12 +36,12 @@ _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
 _ROTATION = {"rad": 1.0, "mrad": 1e3, "deg": 180 / math.pi, "rev": 1 / _TURN}
+_LENGTH = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6}
 # Units per SI unit: values are divided by them, so that milliseconds stay exact.
 _PER_SI: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9},
-    "q": _ROTATION | {"m": 1.0, "mm": 1e3},
-    "qd": {f"{unit}/s": per for unit, per in _ROTATION.items()}
-    | {"rpm": 60 / _TURN, "m/s": 1.0, "mm/s": 1e3},
+    "time": {"min": 1 / 60, "s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9},
+    "q": _ROTATION | _LENGTH,
+    "qd": {f"{x}/s": per for x, per in (_ROTATION | _LENGTH).items()} | {"rpm": 60 / _TURN},
     "tau": {"N m": 1.0, "mN m": 1e3, "N cm": 1e2, "N": 1.0, "mN": 1e3, "kN": 1e-3},
     "motor": _ROTATION,
     "current": {"A": 1.0, "mA": 1e3},
@@ -51,12 +51,13 @@ _SPELLINGS = {
     "Grad": "deg", "Grad/s": "deg/s", "radian": "rad", "radians": "rad", "radians/s": "rad/s",
     "1/min": "rpm", "U/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m", "mNm": "mN m",
     "Nmm": "mN m", "N mm": "mN m", "N*mm": "mN m", "N.mm": "mN m", "Ncm": "N cm",
-    "sec": "s", "msec": "ms", "μs": "us",
+    "sec": "s", "msec": "ms", "μs": "us", "μm": "um", "turns": "rev",
 }  # fmt: skip
 
 
-# Unambiguous units: "rev" may be a direction, and SI units need no mention.
-_UNIT_IN_NAME = re.compile(r"_(ms|us|ns|mrad|deg|mm|rpm|mNm|mA)$")
+# At the end of a name, only unambiguous units: "rev" may be a direction, "cm" a mass centre, and SI
+# units need no mention. Brackets may contain a unit or anything else, but a number is an index.
+_UNIT_IN_NAME = re.compile(r"_(ms|us|ns|mrad|deg|mm|um|rpm|mNm|Ncm|mA)$|[\[(](\D[^\[\]()]*)[\])]$")
 
 
 class Source(NamedTuple):
@@ -125,11 +126,8 @@ def table_arrays(
         if all(group) or (key == "tau" and any(group)):
             stack = [_joint_column(table, key, source, degrees) for source in group]
             arrays[key] = np.stack(stack, axis=1)
-    units = [
-        s.unit
-        for key, s in sources.items()
-        if re.fullmatch(r"q\d+", key) and s.unit and not s.motor
-    ]
+    positions = [sources[f"q{k + 1}"] for k in range(joints)]
+    units = [s.unit for s in positions if s.unit and not s.motor]
     kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
@@ -141,12 +139,13 @@ def table_arrays(
 def parse_source(spec: str, names: set[str]) -> Source | None:
     """The column that a specification such as "enc_1" or "enc_1:deg" names, None if missing.
 
-    A unit at the end of a column's name, as in "speed_rpm", applies unless another one is stated.
+    A unit in a column's name, as in "speed_rpm" or "speed [rpm]", applies unless another is stated.
     """
     stem, _, unit = spec.rpartition(":")
     if spec in names:
         in_name = _UNIT_IN_NAME.search(spec)
-        return Source(spec, in_name and canonical_unit(in_name[1]))
+        unit = canonical_unit(in_name[1] or in_name[2]) if in_name else ""
+        return Source(spec, unit if is_unit(unit) else None)
     return Source(stem, unit) if stem in names and is_unit(unit) else None
 
 
@@ -163,7 +162,7 @@ def is_unit(text: str) -> bool:
 
 def slides(unit: str) -> bool:
     """True for the unit of a sliding joint."""
-    return canonical_unit(unit) in ("m", "mm")
+    return canonical_unit(unit) in _LENGTH
 
 
 def to_si(kind: str, values: Array, unit: str) -> Array:
@@ -172,8 +171,8 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
     Args:
         kind: "time", "q", "qd", "tau", "motor" or "current".
         values: any shape.
-        unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count per turn), m, mm; those per
-            second, rpm; N m, mN m, N, mN; A, mA.
+        unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count per turn), m, cm, mm,
+            um; those per second, rpm; N m, mN m, N cm, N, mN, kN; A, mA; min.
     """
     per = _per_si(kind, unit)
     if per is None:
@@ -199,10 +198,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         )
     names = set(table.columns)
     aliases = _texts(table, "aliases")
-    mapped = {
-        key: parse_source(spec, names) or parse_source(spec, set(aliases))
-        for key, spec in columns.items()
-    }
+    mapped = {key: parse_source(spec, names | set(aliases)) for key, spec in columns.items()}
     found = {key: source for key, source in mapped.items() if source is not None}
     keys: dict[str, list[str]] = {}
     for key, source in found.items():
@@ -290,8 +286,7 @@ def _number(name: str) -> int:
 
 def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> list[tuple[str, str]]:
     """Settle an ambiguous decimal sign; a remark if it remains a guess."""
-    columns = set(table.attrs.get("undecided", ()))
-    used = [source for source in sources.values() if source.column in columns]
+    used = [s for s in sources.values() if s.column in table.attrs.get("undecided", ())]
     for column, unit, *_ in used:
         cell = next(str(cell) for cell in table[column] if set(str(cell)) & set(THOUSANDS))
         sign = "," if "," in cell else "."
@@ -317,6 +312,11 @@ def _remarks(
     if 0 < len(lacking["qd"]) < joints:
         finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
         yield finding, "name the columns of all joints, or of none"
+    for column, unit, *_ in sources.values():
+        bracket = _UNIT_IN_NAME.search(column)
+        if bracket and unit is None:
+            finding = f"column {column}: {bracket[2]!r} is not a known unit and is ignored"
+            yield finding, 'if it is a unit, convert the column, or state one, as in "enc_1:deg"'
     free = lacking["tau"]
     if 0 < len(free) < joints:
         finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
@@ -360,9 +360,8 @@ def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
 
 def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -> str:
     found = [str(name) for name in table.attrs.get("found", table.columns)]
-    shown = ", ".join(name[:60] for name in found[:30]) + (
-        f" … ({len(found)} in all)" if len(found) > 30 else ""
-    )
+    more = f" … ({len(found)} in all)" if len(found) > 30 else ""
+    shown = ", ".join(name[:60] for name in found[:30]) + more
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
     note = f" {unit!r} is not a known unit." if stem in found and not is_unit(unit) else ""
