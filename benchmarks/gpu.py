@@ -1,6 +1,8 @@
 """Candidates in parallel on a GPU: rolled out, and differentiated, in eager torch.
 
-The peer is the compiled rollout on one thread of the processor. Run from the repository's root: `python benchmarks/gpu.py [--candidates 10000 100000]`. Says so
+The peer is the compiled rollout on one thread of the processor.
+
+Run from the repository's root: `python benchmarks/gpu.py [--candidates 10000 100000]`. Says so
 where no GPU is present; `--device cpu` tries the same on the processor.
 """
 

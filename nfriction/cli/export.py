@@ -1,6 +1,7 @@
 """`nfriction export` and `nfriction verify`: artefacts for controllers and simulators."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,9 @@ def add_export(commands: Commands) -> None:
                         help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
     parser.add_argument("--torque-limit", type=inputs.positives, metavar="LIMIT,...",
                         help="limit of the output torque, one number or one per joint")  # fmt: skip
+    parser.add_argument("--sample-time", type=inputs.positive, metavar="SECONDS",
+                        help="time between the controller's samples [s], on which filters and "
+                        "states depend (default: that of the recordings)")  # fmt: skip
     parser.add_argument("--with-filter", action="store_true",
                         help="let the artefact take raw positions and filter them")  # fmt: skip
     parser.add_argument("--cutoff", type=inputs.positive, default=20.0, metavar="HZ",
@@ -85,6 +89,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     if arguments.online and "c" not in arguments.format:
         raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
+    info = replace(info, sample_time=arguments.sample_time or info.sample_time)
     check_writable(arguments.out)
     for target in arguments.format:
         if target in SIMULATORS:

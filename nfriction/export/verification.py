@@ -1,7 +1,7 @@
 """Verify an artefact against a model file: with its own vectors, and at many random points."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def verify_artefact(
     Args:
         path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` in the same folder.
         model: the model, as loaded from its file.
-        info: the model file's description of the model.
+        info: the model file's description of the model; the sample time is the artefact's.
         points: number of random points; at most 2,000 if the controller has a state.
         seed: of the random points.
 
@@ -88,6 +88,10 @@ def verify_artefact(
         raise FileNotFoundError(2, "there is no such file", str(path))
     contract_at, runner = KINDS[path.suffix]
     contract = contract_at(path)
+    try:
+        info = replace(info or ModelInfo(), sample_time=contract.description.get("sample_time"))
+    except (TypeError, ValueError) as error:
+        raise ContractError(f"the metadata's sample time is damaged ({error}).") from error
     controller = _controller(model, info, contract.description)
     # With the model's own contract, because tolerance and scales of a manipulated artefact might
     # accept anything.

@@ -185,3 +185,15 @@ def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
     assert cli.main(["export", str(model), *words]) == 0
     told = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
     assert told["filter"]["cutoff_hz"] == 30.0
+
+
+@pytest.mark.parametrize("suffix", [".c", ".pt"])
+def test_a_controller_may_run_at_another_rate_than_the_recordings(
+    model: Path, tmp_path: Path, suffix: str
+) -> None:
+    if suffix == ".c" and not find_compiler():
+        pytest.skip("no C compiler")
+    words = ["--with-filter", "--sample-time", "4e-3", "--format", "c,torchscript"]
+    assert cli.main(["export", str(model), *words, "--out", str(tmp_path)]) == 0
+    assert "Sample time: 0.004 s" in (tmp_path / "lfm.h").read_text("ascii")
+    assert run_verify(tmp_path / f"lfm{suffix}", model, "--points", 300) == 0
