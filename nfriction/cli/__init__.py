@@ -11,17 +11,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import demo, estimate, export, inspect, torque
-from nfriction.cli.console import (
-    Commands,
-    FirstOfItsKind,
-    Parser,
-    UsageError,
-    drop_output,
-    interruptible,
-    message_of,
-    one_line_warnings,
-)
+from nfriction.cli import console, demo, estimate, export, inspect, torque
 from nfriction.version import __version__
 
 # Functions that register the commands, in the order of the help.
@@ -48,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             sys.stdout.flush()  # otherwise buffered output fails too late to be caught
     except BrokenPipeError:
-        return drop_output()
+        return console.drop_output()
 
 
 def _answer(words: list[str]) -> int:
@@ -69,22 +59,22 @@ def _answer(words: list[str]) -> int:
         return 130
     except BrokenPipeError:
         raise
-    except (UsageError, ValueError, OSError, ImportError) as error:
+    except (console.UsageError, ValueError, OSError, ImportError) as error:
         if arguments.debug:
             raise
-        print(f"nfriction: error: {message_of(error)}", file=sys.stderr)
+        print(f"nfriction: error: {console.message_of(error)}", file=sys.stderr)
         return 2
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = Parser(
+    parser = console.Parser(
         prog="nfriction",
         description="Identify joint friction from encoder logs, and check it by simulating "
         "recordings the fit never saw.",
     )
     parser.add_argument("--version", action="version", version=f"nfriction {__version__}")
-    commands = Commands(parser)
+    commands = console.Commands(parser)
     for add in COMMANDS:
         add(commands)
     return parser
@@ -97,15 +87,15 @@ def _run(arguments: argparse.Namespace) -> int:
     from nfriction.codegen import CodegenError
     from nfriction.export import ExportError
 
-    console = logging.StreamHandler()
-    console.setLevel(logging.WARNING)  # a log file may contain more
-    console.addFilter(FirstOfItsKind())
-    logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", handlers=[console])
+    handler = logging.StreamHandler()
+    handler.setLevel(logging.WARNING)  # a log file may contain more
+    handler.addFilter(console.FirstOfItsKind())
+    logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", handlers=[handler])
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)
     try:
-        with interruptible(), one_line_warnings():
+        with console.interruptible(), console.one_line_warnings():
             return arguments.run(arguments)
     # Linear algebra on unusable data raises torch's own errors.
     except (CodegenError, ExportError, ArithmeticError, torch.linalg.LinAlgError) as error:
-        raise UsageError(str(error)) from error
+        raise console.UsageError(str(error)) from error

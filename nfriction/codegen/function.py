@@ -8,16 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.codegen.batch import (
-    FEW,
-    Driver,
-    Kernel,
-    Layout,
-    common_rows,
-    parameter_rows,
-    rows_of,
-    to_array,
-)
+from nfriction.codegen import batch
 from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule, Method, Program
 from nfriction.codegen.scalar import SelfCheckFailed
@@ -27,7 +18,7 @@ _CHECK_TOLERANCE = 1e-10
 # Number of kernels cached by their computation, with the shapes of their outputs: fits to parts of
 # the data or from several starts share them. Six laws need twelve, of about ten megabytes each.
 _KEPT = 16
-_known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
+_known: OrderedDict[Hashable, tuple[batch.Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 
 class CompiledFunction:
@@ -68,13 +59,13 @@ class CompiledFunction:
         if len(_known) > _KEPT:
             _known.popitem(last=False)
 
-    def _built(self, program: Program) -> tuple[Kernel, dict[str, tuple[int, ...]]]:
+    def _built(self, program: Program) -> tuple[batch.Kernel, dict[str, tuple[int, ...]]]:
         """The kernel of a traced function, and the shapes of its outputs."""
         if self._jacobian:
             program = with_jacobian(program, [f"x{i}" for i in self._jacobian])
         outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
-        layout = Layout(tuple(self._inputs), tuple(outputs))
-        return Kernel(lambda width: _driver(program, layout, width), layout), outputs
+        layout = batch.Layout(tuple(self._inputs), tuple(outputs))
+        return batch.Kernel(lambda width: _driver(program, layout, width), layout), outputs
 
     def __call__(self, *inputs: Any) -> Any:
         """Evaluate row by row.
@@ -91,11 +82,11 @@ class CompiledFunction:
         if len(inputs) != len(self._inputs):
             raise ValueError(f"expected {len(self._inputs)} inputs, got {len(inputs)}.")
         given = {
-            name: rows_of(f"input {name[1:]}", x, shape)
+            name: batch.rows_of(f"input {name[1:]}", x, shape)
             for (name, shape), x in zip(self._inputs.items(), inputs, strict=True)
         }
-        rows = common_rows({name: one.rows for name, one in given.items()})
-        p, _ = parameter_rows(self._module, {})
+        rows = batch.common_rows({name: one.rows for name, one in given.items()})
+        p, _ = batch.parameter_rows(self._module, {})
         out = {name: np.empty((rows, *shape)) for name, shape in self._outputs.items()}
         self.kernel(rows, p, given, out)
         return tuple(out.values()) if len(out) > 1 else out["y0"]
@@ -120,9 +111,9 @@ class CompiledFunction:
             with torch.no_grad():
                 eager = self._eager([x.to(self._module.device) for x in inputs])
             # Enough rows for the vector code, which most calls use.
-            ours = self(*(x.expand(FEW, *x.shape) for x in inputs))
+            ours = self(*(x.expand(batch.FEW, *x.shape) for x in inputs))
             for a, b in zip(ours if isinstance(ours, tuple) else (ours,), eager, strict=True):
-                expected = to_array(b)
+                expected = batch.to_array(b)
                 tolerance = _CHECK_TOLERANCE
                 if not np.allclose(a[0], expected, tolerance, tolerance, equal_nan=True):
                     raise SelfCheckFailed(
@@ -149,7 +140,7 @@ def _tuple(found: Any) -> tuple[Tensor, ...]:
     return tuple(found) if isinstance(found, (tuple, list)) else (found,)
 
 
-def _driver(program: Program, layout: Layout, width: int) -> Driver:
+def _driver(program: Program, layout: batch.Layout, width: int) -> batch.Driver:
     """A loop over rows."""
     groups, once = hoist(program.graph, [port.nodes for port in program.outputs])
     outputs = dict(zip(layout.outputs, groups, strict=True))
@@ -162,7 +153,7 @@ def _driver(program: Program, layout: Layout, width: int) -> Driver:
         places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
         sizes |= {port.name: len(port.nodes)} if own else {}
         parameters += 0 if own else len(port.nodes)
-    driver = Driver(layout, width, sizes, len(once))
+    driver = batch.Driver(layout, width, sizes, len(once))
     write_function(driver.body, "nf_once", {"once": once}, places, ["p"], [], seldom=True)
     places |= {node.number: ("once", i) for i, node in enumerate(once)}
     shared = ["p", "once"]

@@ -408,13 +408,13 @@ def compare(
 def _warn_of_mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> None:
     """Warn of likely mistakes in test recordings, unless the fit names some in its own."""
     known, both = {*finer_counts(plant, train.recordings)}, [*train.recordings, *test.recordings]
-    found = [told for told in finer_counts(plant, both) if told not in known]
+    found = [text for text in finer_counts(plant, both) if text not in known]
     for recording, moved in () if fit.mistakes else zip(*test, strict=True):
         joint = fit.aligned(recording.joint_coordinates(plant))
         mistakes = likely_mistakes(plant, [joint], [moved], recording.resolve_convention(plant))
-        found += [f"{recording.name or 'test'}: {told}" for told in mistake_warning(*mistakes)]
-    for told in found:
-        warnings.warn(told, stacklevel=1)
+        found += [f"{recording.name or 'test'}: {text}" for text in mistake_warning(*mistakes)]
+    for text in found:
+        warnings.warn(text, stacklevel=1)
 
 
 def _warn_of_faster(plant: Plant, train: Data, test: Data) -> None:
