@@ -122,6 +122,7 @@ def cut_windows(
     motions: Sequence[Motion],
     length: float,
     *,
+    smoothed: Sequence[Motion] | None = None,
     rest_speed: float | None = None,
 ) -> Windows:
     """Cut recordings into windows of about `length` seconds that cover all but gaps and final rest.
@@ -129,6 +130,7 @@ def cut_windows(
     Args:
         recordings, motions: in joint coordinates; a recording shorter than `length` is one window.
         length: [s].
+        smoothed: motions that show the final rest if `motions` are simulated.
         rest_speed: recordings that begin slower than this [rad/s] start from rest instead of from
             the smoothed motion; by default none does.
 
@@ -140,7 +142,7 @@ def cut_windows(
     spans = [
         (place, first, last)
         for place, recording in enumerate(recordings)
-        for first, last in _cut(recording, motions[place], length)
+        for first, last in _cut(recording, (smoothed or motions)[place], length)
     ]
     steps = max(last - first for _, first, last in spans)
     joints = recordings[0].q.shape[1]

@@ -106,11 +106,15 @@ class ShootingFitter:
     offset_sd: Tensor | None = None
     extrapolation: ExtrapolationPrior | None = None
 
-    def cut(self, motions: Sequence[Motion], length: float) -> Windows:
-        """Windows of the recordings, each starting from the state of its motion."""
+    def cut(
+        self, motions: Sequence[Motion], length: float, smoothed: Sequence[Motion] | None = None
+    ) -> Windows:
+        """Windows of recordings, each from the state of its motion; see `cut_windows`."""
         # Encoders zeroed in a pose that stiction holds were zeroed at rest.
         rest_speed = None if self.offset_sd is None else self.options.rest_speed
-        return cut_windows(self.recordings, motions, length, rest_speed=rest_speed)
+        return cut_windows(
+            self.recordings, motions, length, smoothed=smoothed, rest_speed=rest_speed
+        )
 
     def problem(
         self, windows: Windows, noise: float, friction: Tensor, *, stride: int = 1
@@ -257,7 +261,7 @@ def horizon_continuation(
     noise, simulated = options.first_noise, motions
     for place, length in enumerate(options.windows):
         rest, last = tuple(options.windows[place:]), place + 1 == len(options.windows)
-        problem = fitter.problem(fitter.cut(simulated, length), noise, friction)
+        problem = fitter.problem(fitter.cut(simulated, length, motions), noise, friction)
         start = problem.variables.start(plant, offsets)
         if stages:
             # Simulations from the states of shorter windows diverge over longer ones. Correcting
