@@ -18,17 +18,8 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from nfriction.evaluation import tables
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES
-from nfriction.evaluation.tables import (
-    Table,
-    Value,
-    coefficient_table,
-    coefficient_units,
-    error_table,
-    four_digits,
-    interval_table,
-    selection_table,
-)
 from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
@@ -210,9 +201,9 @@ def to_html(run: Run) -> str:
         error=error,
         info=info,
         tables={
-            "errors": [error_table(comparison, part) for part in comparison.parts],
+            "errors": [tables.error_table(comparison, part) for part in comparison.parts],
             "recordings": _recording_table(run),
-            "selection": run.selection and selection_table(run.selection),
+            "selection": run.selection and tables.selection_table(run.selection),
             "data": _data_table(run),
             "ranges": info and _range_table(info, comparison.joint_names, comparison.unit),
         },
@@ -291,10 +282,10 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         silent = [name for name in names if not any(name in warning for warning in fit.warnings)]
         if silent:
             warnings.append(f"{what}: {'; '.join(silent)}.")
-    tables = []
+    shown = []
     sets = run.coefficients.get(name, {})
     if sets:
-        tables.append(coefficient_table(name, joints, sets, _units(run, name)))
+        shown.append(tables.coefficient_table(name, joints, sets, _units(run, name)))
     known = fit.plant | {
         f"{coefficient} of {joint}": value
         for coefficient, values in sets.get("always", {}).items()
@@ -305,7 +296,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for what, (low, high) in fit.intervals.items()
     ]
     if intervals:
-        tables.append(interval_table(name, intervals, bool(fit.plant)))
+        shown.append(tables.interval_table(name, intervals, bool(fit.plant)))
     unfit = run.unfit.get(name)
     verdict, why = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
     return {
@@ -315,7 +306,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         "why": why,
         # Fits that start from each other may pass on the same warning.
         "warnings": list(dict.fromkeys(warnings)),
-        "tables": tables,
+        "tables": shown,
     }
 
 
@@ -335,12 +326,13 @@ def _cards(run: Run) -> list[dict[str, Any]]:
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
             if len(values) > 1:
-                value = f"{four_digits(min(values))} to {four_digits(max(values))}{unit}"
+                ends = map(tables.four_digits, (min(values), max(values)))
+                value = " to ".join(ends) + unit
                 note = "follows the motion"
             else:
-                value = f"{four_digits(values[0])}{unit}"
+                value = f"{tables.four_digits(values[0])}{unit}"
                 if math.isfinite(low) and math.isfinite(high):
-                    note = f"{four_digits(low)} to {four_digits(high)}"
+                    note = f"{tables.four_digits(low)} to {tables.four_digits(high)}"
                 elif not math.isnan(low):
                     note = "not identifiable"
             lines.append({"name": name, "value": value, "note": note})
@@ -352,7 +344,7 @@ def _units(run: Run, model: str) -> dict[str, str]:
     """Unit of each coefficient, if the model's file exists."""
     if model not in run.models:
         return {}
-    return coefficient_units(run.models[model][0], run.comparison.unit)
+    return tables.coefficient_units(run.models[model][0], run.comparison.unit)
 
 
 def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
@@ -372,11 +364,11 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
         fired = run.fits[name].rule_seconds
         for j, of in enumerate(in_words):
             seconds = fired[j] if len(fired) == len(in_words) else ()
-            rows: tuple[tuple[Value, ...], ...] = tuple(
+            rows: tuple[tuple[tables.Value, ...], ...] = tuple(
                 (f"{rule.condition} THEN", *rule.values, *seconds[k : k + 1])
                 for k, rule in enumerate(of.rules)
             )
-            terms: tuple[tuple[Value, ...], ...] = tuple(
+            terms: tuple[tuple[tables.Value, ...], ...] = tuple(
                 (f"{quantity}: {term.name}", term.centre, term.width, u)
                 for quantity, terms, u in (
                     ("velocity", of.velocity, f"{unit}/s"),
@@ -386,18 +378,18 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             )
             head, columns = f"{name}, {of.joint}", ("word", "centre", "standard deviation", "unit")
             joints.append({
-                "rules": Table(
+                "rules": tables.Table(
                     f"{head}: {len(rows)} rules",
                     ("rule", *heads, *(["recorded [s]"] if seconds else [])), rows,
                 ),
-                "terms": Table(f"{head}: meaning of the words", columns, terms),
+                "terms": tables.Table(f"{head}: meaning of the words", columns, terms),
             })  # fmt: skip
         yield found | {"joints": joints}
 
 
-def _recording_table(run: Run) -> Table:
+def _recording_table(run: Run) -> tables.Table:
     """The free-run error of every model on every recording, with the limit of these data."""
-    rows: list[tuple[Value, ...]] = []
+    rows: list[tuple[tables.Value, ...]] = []
     for part in run.comparison.parts:
         for model, scores in run.comparison.scores(part).items():
             for s in scores:
@@ -406,7 +398,7 @@ def _recording_table(run: Run) -> Table:
                 zero = ", ".join(f"{1e3 * x:.3g}" for x in s.zero or ()) or "as recorded"
                 rows.append((s.recording, model, part, 1e3 * s.free_run.all, limit, at, zero))
     unit = run.comparison.unit
-    return Table(
+    return tables.Table(
         "Free runs over all joints, by recording",
         ("recording", "model", "part", f"RMSE [m{unit}]", f"{LIMIT} [m{unit}]",
          "diverged", f"zero of the encoders [m{unit}]"),
@@ -414,16 +406,16 @@ def _recording_table(run: Run) -> Table:
     )  # fmt: skip
 
 
-def _data_table(run: Run) -> Table:
+def _data_table(run: Run) -> tables.Table:
     rows = tuple(
         (name, PART_NAMES[part].removesuffix("s"), digest[:16])
         for part in reversed(PART_NAMES)
         for name, digest in run.recordings[part].items()
     )
-    return Table("Recordings", ("recording", "part", "digest of its samples"), rows)
+    return tables.Table("Recordings", ("recording", "part", "digest of its samples"), rows)
 
 
-def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | None:
+def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> tables.Table | None:
     """Trained range of velocity and acceleration; None if the file has none in this form."""
     columns: list[str] = []
     ends: list[list[float]] = []
@@ -438,7 +430,7 @@ def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | N
     if not ends:
         return None
     rows = tuple(zip(joints, *ends, strict=True))
-    return Table("Motion that the models were trained on", ("joint", *columns), rows)
+    return tables.Table("Motion that the models were trained on", ("joint", *columns), rows)
 
 
 def _commands(run: Run) -> list[str]:
