@@ -156,10 +156,10 @@ class FitOptions:
     # --- Hold-out of a network.
     # Every `folds`-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
-    # Chance that scatter counts as a gain on hold-out windows: one standard error for a network,
-    # which its prior keeps near its law.
+    # Chance that scatter counts as a gain on hold-out windows: one standard error, because priors
+    # keep a network near its law, and the evidence has judged further inputs before.
     gain_chance: float = 0.16
-    # The same for a further input, which is a new term of the law and one of several candidates.
+    # The same for an input in fits of torque tables, which no evidence has judged before.
     input_chance: float = 0.05
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)

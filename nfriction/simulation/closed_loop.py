@@ -13,23 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.codegen.rollout import SPEED_LIMIT
+from nfriction.simulation import protocols, validate
 from nfriction.simulation.compiled import System
-from nfriction.simulation.protocols import (
-    Friction,
-    NoFriction,
-    Plant,
-    Rollout,
-    RolloutInputs,
-    as_stateful,
-    with_sample_time,
-)
 from nfriction.simulation.rollout import simulate
-from nfriction.simulation.validate import (
-    outside_inference_mode,
-    require_stability,
-    validate_inputs,
-    with_states,
-)
 
 Array = NDArray[np.float64]
 
@@ -97,7 +83,7 @@ class Electronics:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControlledMotion(Rollout):
+class ControlledMotion(protocols.Rollout):
     """A motion under a controller.
 
     Attributes:
@@ -109,11 +95,11 @@ class ControlledMotion(Rollout):
     measured: Tensor
 
 
-@outside_inference_mode
+@validate.outside_inference_mode
 @torch.no_grad()
 def control(
-    plant: Plant,
-    friction: Friction | None,
+    plant: protocols.Plant,
+    friction: protocols.Friction | None,
     controller: Feedback,
     q0: Tensor,
     qd0: Tensor,
@@ -139,19 +125,19 @@ def control(
         ValueError: if inputs do not fit, friction is too steep at rest for a stable integration, or
             the controller gives a torque of another shape or one that is not finite.
     """
-    model = NoFriction(plant.joints) if friction is None else friction
+    model = protocols.NoFriction(plant.joints) if friction is None else friction
     sample_time, substeps = electronics.sample_time, electronics.substeps
-    model = with_sample_time(model, torch.tensor([sample_time]).double())
-    given = with_states(
-        validate_inputs(plant, model, q0, qd0, None, sample_time, steps, substeps), model
+    model = protocols.with_sample_time(model, torch.tensor([sample_time]).double())
+    given = validate.with_states(
+        validate.validate_inputs(plant, model, q0, qd0, None, sample_time, steps, substeps), model
     )
     system = System.of(plant, model)
-    require_stability(system, given)
+    validate.require_stability(system, given)
     q, qd, step, axis = given.q0, given.qd0, given.step[:1], given.q0.ndim - 1
     law = [] if given.law_state is None else [given.law_state]
     states = [(q, qd, plant.forward_dynamics(q, qd, torch.zeros_like(q)), *law)]
     hidden: Tensor | None = None
-    stateful = as_stateful(model)
+    stateful = protocols.as_stateful(model)
     torques, readings = [], []
     waiting = [np.zeros(q.shape)] * electronics.delay
     diverged_at = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
@@ -166,7 +152,9 @@ def control(
                 stateful.initial_state(*motion) if hidden is None
                 else stateful.advance(*motion, hidden)
             )  # fmt: skip
-        inputs = RolloutInputs(q, qd, tau.unsqueeze(-2), step, substeps, None, hidden, *law)
+        inputs = protocols.RolloutInputs(
+            q, qd, tau.unsqueeze(-2), step, substeps, None, hidden, *law
+        )
         after = [x.select(axis, -1).clone() for x in simulate(system, inputs)]
         states.append(tuple(after))
         q, qd, _, *law = after

@@ -61,7 +61,8 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH)
     task = prepare_task(model, pendulum(), [recording], FitOptions(**BRIEF))
-    found = chosen_inputs(task, law)
+    found, refitted = chosen_inputs(task, law)
+    assert (refitted is law) == (not found)
     if name == "nothing":
         assert all(gain.share < 0.2 for gain in found)
     else:
@@ -136,8 +137,7 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
         made.append(Contest(task, start, **rival))
         return made[-1]
 
-    monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
-    monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
+    monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: (gains, start))
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
     monkeypatch.setattr(neurofuzzy, "drives", lambda found, own: driving and own == 2)
     plain = Contest(task, "law")
@@ -187,34 +187,36 @@ def choice_of(gradient: float, lower: float = -9.0) -> _Choice:
     return _Choice(errors, Quadratic(0.0, zero, one), bounds, {"load": [1]})
 
 
-@pytest.mark.parametrize("scale", [1.0, 5.0])
-def test_evidence_is_the_integral_over_the_coefficient(scale) -> None:
+def test_evidence_is_the_integral_over_the_coefficient() -> None:
     choice, x = choice_of(-6.0), torch.linspace(-9.0, 9.0, 20001, dtype=torch.float64)
-    density = torch.exp(scale * (6.0 * x - 1.5 * x**2) - 0.5 * x**2) / (2.0 * torch.pi) ** 0.5
+    density = torch.exp(6.0 * x - 2.0 * x**2) / (2.0 * torch.pi) ** 0.5
     expected = float(torch.trapezoid(density, x).log())
-    (after, cost), (before, whole) = choice.evidence([1], scale), choice.evidence([], scale)
+    (after, cost), (before, whole) = choice.evidence([1]), choice.evidence([])
     assert after - before == pytest.approx(expected, rel=1e-9)
-    found = 6.0 * scale / (3.0 * scale + 1.0)
-    assert (cost, whole) == pytest.approx((20.0 - 6.0 * found + 1.5 * found**2, 20.0))
-    (gain,) = choice.forward(1.0)
+    assert (cost, whole) == pytest.approx((20.0 - 6.0 * 1.5 + 1.5 * 1.5**2, 20.0))
+    gain = choice.best([], 1.0)
+    assert gain is not None
     assert gain.share == pytest.approx((6.0 * 1.5 - 1.5 * 1.5**2) / 20.0)
 
 
 def test_an_input_that_its_sign_forbids_has_no_evidence() -> None:
     choice = choice_of(6.0, lower=0.0)
-    assert choice.evidence([1], 1.0)[0] < choice.evidence([], 1.0)[0]
-    assert not choice.forward(0.0)
+    assert choice.evidence([1])[0] < choice.evidence([])[0]
+    assert choice.best([], 0.0) is None
 
 
-def test_an_input_is_judged_beside_the_noise_that_those_before_leave() -> None:
-    one, zero = torch.eye(2).double(), torch.zeros(2).double()
-    slope = torch.tensor([-18.0, -3.0]).double()
+def test_an_input_is_chosen_beside_those_before() -> None:
+    eye, slope = torch.eye(2).double(), torch.tensor([-18.0, -3.0]).double()
     bounds = torch.full((2,), -9.0).double(), torch.full((2,), 9.0).double()
-    errors = Quadratic(torch.tensor(18.0).double(), slope, 10.0 * one)
-    choice = _Choice(errors, Quadratic(0.0, zero, one), bounds, {"heat": [0], "load": [1]})
-    # Beside the noise of the law the second gains less than its coefficient costs.
-    assert choice.evidence([1], 1.0)[0] < choice.evidence([], 1.0)[0]
-    assert [gain.name for gain in choice.forward(0.5)] == ["heat", "load"]
+    errors = Quadratic(torch.tensor(18.0).double(), slope, 10.0 * eye)
+    prior = Quadratic(0.0, 0.0 * slope, eye)
+    choice = _Choice(errors, prior, bounds, {"heat": [0], "load": [1]})
+    first, second = choice.best([], 0.0), choice.best(["heat"], -9.0)
+    assert first is not None
+    assert second is not None
+    assert (first.name, second.name) == ("heat", "load")
+    # It gains less than its coefficient costs.
+    assert choice.best(["heat"], 0.0) is None
 
 
 def test_window_states_are_at_their_best() -> None:

@@ -35,7 +35,7 @@ from nfriction.fitting.task import (
     regression,
 )
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.heat import HeatedConstant
+from nfriction.friction.heat import Heated, HeatedConstant
 from nfriction.friction.inputs import INPUTS, is_heated, with_inputs
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
@@ -94,24 +94,33 @@ def heated_schedule(
 
 
 def widened_fitter(
-    task: FitTask, start: FitResult, inputs: Sequence[str], cooling_time: float = math.nan
+    task: FitTask,
+    start: FitResult,
+    inputs: Sequence[str],
+    cooling_time: float = math.nan,
+    at: FitResult | None = None,
 ) -> ShootingFitter:
     """Fitter of constant coefficients of a law and of inputs, started from a fit of the law.
 
-    `cooling_time` [s] is the time constant of the input heat.
+    `cooling_time` [s] is the time constant of the input heat; `at` is a fit with some of the inputs
+    to start from instead.
     """
     law, plant = with_inputs(start.model.law, inputs), seeing_plant(task.plant, inputs)
-    known = start.model.schedule.coefficient_sets()["always"]
-    initial = torch.cat([known, known.new_zeros(len(known), len(law.names) - known.shape[1])], 1)
+    at = at or start
+    values = at.model.schedule.coefficient_sets()["always"].T
+    known = dict(zip(at.model.law.names, values, strict=True))
+    initial = torch.stack([known.get(name, 0.0 * values[0]) for name in law.names], -1)
     schedule = Constant(law, start.model.joints, initial)
     if is_heated(law):
         schedule = heated_schedule(law, initial, task.motions, cooling_time)
+        if isinstance(seen := at.model.schedule, Heated):
+            schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
     model = FrictionModel(law, schedule, start.model.v_smooth)
     terms = adjustable_terms(
         plant, task.recordings, task.options, eccentric=fits_eccentricity(task.options, start),
         per_recording=bool(start.encoder_offsets),
     )  # fmt: skip
-    torque = regression(task, model, seeing_plant(start.plant, inputs))
+    torque = regression(task, model, seeing_plant(at.plant, inputs))
     return ShootingFitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, task.options,
         task.callback, friction_prior=constant_prior(model, torque, task.options),
@@ -186,17 +195,31 @@ def drives(found: FitResult, own: int) -> bool:
     return False
 
 
-def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
-    """Inputs favoured by the evidence, the best first, each given the previous ones.
+def chosen_inputs(task: FitTask, start: FitResult) -> tuple[tuple[InputGain, ...], FitResult]:
+    """Inputs favoured by the evidence, and the constant fit with them.
+
+    Forward selection: each raises the evidence of the fit with the previous ones most.
 
     Args:
         task: with encoder offsets removed from recordings and motions.
         start: constant fit of the law.
+
+    Raises:
+        StoppedError: if the caller stops a search.
     """
-    names = candidates(task)
-    fitter = widened_fitter(task, start, names, longest_duration(task.motions))
-    choice = _Choice.of(fitter, task, start, names)
-    return () if choice is None else tuple(choice.forward(task.options.evidence_gain))
+    names, at = candidates(task), start
+    chosen: list[InputGain] = []
+    while len(chosen) < len(names):
+        fitter = widened_fitter(task, start, names, longest_duration(task.motions), at)
+        choice, held = _Choice.of(fitter, task, at, names), [gain.name for gain in chosen]
+        best = choice.best(held, task.options.evidence_gain) if choice else None
+        if best is None:
+            break
+        found = widened_start(task, start, [*held, best.name])
+        if found is None:
+            raise StoppedError
+        chosen, at = [*chosen, best], found
+    return tuple(chosen), at
 
 
 @dataclass(frozen=True)
@@ -240,37 +263,26 @@ class _Choice:
         )  # fmt: skip
         return cls(errors, prior, bounds, columns)
 
-    def forward(self, least: float) -> list[InputGain]:
-        """Forward selection of inputs, as long as one raises the log evidence by more than `least`.
+    def best(self, held: Sequence[str], least: float) -> InputGain | None:
+        """The input that raises the log evidence most beside those held; None if below `least`."""
+        columns = [column for name in held for column in self.columns[name]]
+        before, left = self.evidence(columns)
+        found = {
+            name: self.evidence([*columns, *more])
+            for name, more in self.columns.items()
+            if name not in held
+        }
+        best = max(found, key=lambda name: found[name][0])
+        if not found[best][0] - before > least:
+            return None
+        each = [self.evidence([*columns, column])[1] for column in self.columns[best]]
+        by_joint = tuple(1.0 - alone / left for alone in each)
+        return InputGain(best, 1.0 - found[best][1] / left, by_joint)
 
-        Each is judged relative to the residual noise with the inputs selected so far.
-        """
-        chosen: list[InputGain] = []
-        held: list[int] = []
-        while len(chosen) < len(self.columns):
-            scale = float(self.errors.cost) / self.evidence(held, 1.0)[1] if held else 1.0
-            before, left = self.evidence(held, scale)
-            found = {
-                name: self.evidence([*held, *columns], scale)
-                for name, columns in self.columns.items()
-                if columns[0] not in held
-            }
-            best = max(found, key=lambda name: found[name][0])
-            if not found[best][0] - before > least:
-                break
-            by_joint = tuple(
-                1.0 - self.evidence([*held, column], scale)[1] / left
-                for column in self.columns[best]
-            )
-            chosen.append(InputGain(best, 1.0 - found[best][1] / left, by_joint))
-            held += self.columns[best]
-        return chosen
-
-    def evidence(self, held: Sequence[int], scale: float) -> tuple[float, float]:
+    def evidence(self, held: Sequence[int]) -> tuple[float, float]:
         """Log evidence with the columns `held`, up to a constant, and the cost of the errors.
 
-        Laplace's approximation at the minimum within the bounds. The squared errors are multiplied
-        by `scale`, to account for a noise smaller than that of the law.
+        Laplace's approximation at the minimum within the bounds.
         """
         others = {c for columns in self.columns.values() for c in columns}.difference(held)
         free = [k for k in range(len(self.prior.gradient)) if k not in others]
@@ -284,8 +296,8 @@ class _Choice:
         def model(x: Tensor) -> Quadratic:
             errors, prior = at(self.errors, x), at(self.prior, x)
             return Quadratic(
-                scale * errors.cost + prior.cost, scale * errors.gradient + prior.gradient,
-                scale * errors.hessian + prior.hessian,
+                errors.cost + prior.cost, errors.gradient + prior.gradient,
+                errors.hessian + prior.hessian,
             )  # fmt: skip
 
         start = torch.zeros(len(free), dtype=torch.float64)

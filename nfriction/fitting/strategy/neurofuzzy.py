@@ -123,22 +123,18 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
     """Inputs that improve law and network on hold-out windows (or none), and their contest."""
     task = plain.task
-    chosen = chosen_inputs(task, plain.start)
+    chosen, start = chosen_inputs(task, plain.start)
+    if not chosen:
+        return (), plain
     names = [gain.name for gain in chosen]
-    if not names:
-        return (), plain
-    start = widened_start(task, plain.start, names)
-    if start is None:
-        return (), plain
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    chance = task.options.input_chance
-    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
+    if not gains(rival.validation.of_law, plain.validation.of_law):
         return (), plain
     rival.train()
-    if not gains(rival.squares, plain.squares, chance):
+    if not gains(rival.squares, plain.squares):
         return (), plain
     # Friction of the constant law may drive a joint even if that of its network does not.
     return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)

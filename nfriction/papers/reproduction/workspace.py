@@ -85,7 +85,6 @@ FULL = Settings()
 QUICK = Settings(
     tlrip_seconds=10.0,
     rtip_seconds=10.0,
-    max_steps=5,
     terms=(3, 3),
     head_units=5,
     controller_samples=2000,
