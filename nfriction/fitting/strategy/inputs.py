@@ -9,6 +9,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -113,7 +114,8 @@ def widened_fitter(
     schedule = Constant(law, start.model.joints, initial)
     if is_heated(law):
         schedule = heated_schedule(law, initial, task.motions, cooling_time)
-        if isinstance(seen := at.model.schedule, Heated):
+        if is_heated(at.model.law):
+            seen = cast("Heated", at.model.schedule)
             schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
     model = FrictionModel(law, schedule, start.model.v_smooth)
     terms = adjustable_terms(
