@@ -245,7 +245,7 @@ _RULES: dict[str, Rule] = {
     "sym_size": lambda g, a, dim: Unknown(-1),
     "_assert_tensor_metadata": lambda g, *_, **__: None,
     "_assert_scalar": lambda g, *_, **__: None,
-    # Up to torch 2.8, of sizes, for such an assertion.
+    # torch up to 2.8 compares sizes for such an assertion.
     "<built-in function eq>": lambda g, *_: Unknown(-1),
 }  # fmt: skip
 

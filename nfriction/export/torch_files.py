@@ -251,7 +251,7 @@ def _program(controller: Controller, metadata: str) -> bytes:
             torch.export.save(program, buffer, extra_files={METADATA: metadata})
     except ValueError as error:
         raise ExportError(
-            f"torch {torch.__version__} cannot write a .pt2 of it; use a newer one ({error})."
+            f"torch {torch.__version__} cannot write this model as .pt2; use a newer one ({error})."
         ) from error
     return buffer.getvalue()
 
