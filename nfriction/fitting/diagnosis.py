@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.fitting.adjusted_plant import adjusted_buffers
+from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_buffers, adjusted_plant
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.paired_test import gains, student_quantile
@@ -120,6 +120,12 @@ def likely_mistakes(
         if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
             sound = min(delay[1], sound)
     tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
+    for term, x, rig in _scaled_terms(plant, given, options):
+        share = _unexplained(rig, given)
+        if term.lower <= x <= term.upper:
+            sound = min(share, sound)  # The fit corrects this by itself.
+        else:
+            tested.append((f"{term.name} is {1 + x:.3g} times that of the rig", share))
     # With different zeros, recordings of the same rig have different balances.
     if len(recordings) > 1 and not zeroed:
         most = sound / options.diagnosis_ratio
@@ -192,7 +198,7 @@ def _tested(
         step = recordings[0].sample_time
         for text, data in (*_saturated(plant, given), *_elastic(plant, given, step)):
             yield text, _unexplained(plant, data)
-    for text, rig in _corrected_terms(plant, given, options):
+    for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)
 
 
@@ -354,18 +360,8 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
                 yield text, plant.from_dict({**data, **parts})
 
 
-def _corrected_terms(
-    plant: Plant, given: _Data, options: FitOptions
-) -> Iterator[tuple[str, Plant]]:
+def _missing_rotors(plant: Plant, given: _Data, options: FitOptions) -> Iterator[tuple[str, Plant]]:
     own = dict(plant.named_buffers())
-    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
-    for term in plant_parameters(plant, driven=driven, options=options):
-        if term.ratio and term.name.startswith(("inertia", "gravity", "mass")):
-            change = {name: own[name] * part for name, part in term.change.items()}
-            x = _amount(plant, change, given)
-            if x > term.upper or -1 < x < term.lower:
-                changed = {name: own[name] + x * part for name, part in change.items()}
-                yield f"{term.name} is {1 + x:.3g} times that of the rig", plant.replace(**changed)
     for j, name in enumerate(plant.joint_names) if "armature" in own else ():
         unit = torch.zeros_like(own["armature"])
         unit[j] = 1.0
@@ -375,6 +371,21 @@ def _corrected_terms(
             seen = f"of {float(armature[j]):.3g} kg m^2 seen at the joint"
             text = f"{name} has a rotor inertia {seen} (`armature`, or that of its `motor`)"
             yield text, plant.replace(armature=armature)
+
+
+def _scaled_terms(
+    plant: Plant, given: _Data, options: FitOptions
+) -> Iterator[tuple[PlantParameter, float, Plant]]:
+    """Each term of inertia and gravity, the relative change that explains most, and its rig."""
+    own = dict(plant.named_buffers())
+    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    for term in plant_parameters(plant, driven=driven, options=options):
+        if term.ratio and term.name.startswith(("inertia", "gravity", "mass")):
+            x = _amount(
+                plant, {name: own[name] * part for name, part in term.change.items()}, given
+            )
+            if x > -1:
+                yield term, x, adjusted_plant(plant, [term], given.q.new_tensor([x]))
 
 
 def _corrected_torques(

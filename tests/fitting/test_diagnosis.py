@@ -302,6 +302,12 @@ def test_mistakes_in_rigs(name, rig, finding):
     assert finding in warnings_of(plant, q, tau)[0]
 
 
+def test_an_inertia_that_the_fit_corrects_is_no_mistake():
+    plant, q, tau = measured("wheel")
+    less = 0.93 * plant.inertia_coupling
+    assert warnings_of(plant.replace(inertia_coupling=less), q, tau) == ()
+
+
 @pytest.mark.parametrize("name", ["free", pytest.param("driven", marks=pytest.mark.slow)])
 def test_mistakes_in_conventions_and_time(name):
     plant, q, tau = measured(name)
