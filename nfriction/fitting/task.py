@@ -8,28 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nfriction.fitting import diagnosis
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
-from nfriction.fitting.data.inputs import (
-    ZEROED_PER_RECORDING,
-    advanced_torques,
-    as_model,
-    as_recording_list,
-    data_warnings,
-    in_joint_coordinates,
-    largest_torques,
-    looks_zeroed_per_recording,
-    measurement_matrix,
-    require_doubles,
-    require_drive,
-    smoothed_motions,
-)
-from nfriction.fitting.diagnosis import (
-    balanced_delay,
-    changing_friction,
-    likely_mistakes,
-    loose_loads,
-    mistake_warning,
-)
+from nfriction.fitting.data import inputs
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
@@ -92,54 +73,54 @@ def prepare_task(
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
     # Checked before much time is spent on recordings.
-    checked = as_model(model, plant.joints)
-    require_doubles(checked, plant)
-    given = as_recording_list(recordings, plant)
-    joint = in_joint_coordinates(plant, given, checked.joints)
-    moved = smoothed_motions(joint, motions)
-    model = as_model(model, plant.joints, moved)
+    checked = inputs.as_model(model, plant)
+    inputs.require_doubles(checked, plant)
+    given = inputs.as_recording_list(recordings, plant)
+    joint = inputs.in_joint_coordinates(plant, given, checked.joints)
+    moved = inputs.smoothed_motions(joint, motions)
+    model = inputs.as_model(model, plant, joint, moved)
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
             "maxwell-slip."
         )
-    require_drive(model.law, joint)
+    inputs.require_drive(model.law, joint)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     guessed = (
         options.encoder_reference == "auto"
         # Torques depend too little on a constant offset of the encoders to estimate one.
         and options.method == "output_error"
-        and looks_zeroed_per_recording(plant, given, options)
+        and inputs.looks_zeroed_per_recording(plant, given, options)
     )
     per_recording = guessed or options.encoder_reference == "per_recording"
     convention = given[0].resolve_convention(plant)
     delay = 0.0
     if options.fit_delay:
-        if not largest_torques(joint).any():
+        if not inputs.largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
         # A search by simulation finds the delay only from a start within a cycle of the motion.
-        delay, _ = balanced_delay(plant, joint, moved, options)
-    advanced = advanced_torques(joint, delay)
+        delay, _ = diagnosis.balanced_delay(plant, joint, moved, options)
+    advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
-    stated, mistakes = likely_mistakes(
+    stated, mistakes = diagnosis.likely_mistakes(
         plant, advanced, moved, convention, options, zeroed=per_recording
     )
-    named = mistake_warning(stated, mistakes)
+    named = diagnosis.mistake_warning(stated, mistakes)
     for sentence in named:
         # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
     of = plant, advanced, moved, options
-    drift = () if mistakes else tuple(changing_friction(*of))
-    play = () if mistakes else tuple(loose_loads(*of))
+    drift = () if mistakes else tuple(diagnosis.changing_friction(*of))
+    play = () if mistakes else tuple(diagnosis.loose_loads(*of))
     found = (
         *named,
         *drift,
         *play,
-        *((ZEROED_PER_RECORDING,) if guessed else ()),
-        *data_warnings(plant, given, joint, moved, options),
+        *((inputs.ZEROED_PER_RECORDING,) if guessed else ()),
+        *inputs.data_warnings(plant, given, joint, moved, options),
     )
-    measurement = measurement_matrix(plant, convention)
+    measurement = inputs.measurement_matrix(plant, convention)
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, tuple(m.text for m in mistakes), drift, play,
@@ -148,7 +129,7 @@ def prepare_task(
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:
     """Constant coefficients implied by the torques on a plant; see `fit_equation_error`."""
-    recordings = advanced_torques(task.recordings, task.delay)
+    recordings = inputs.advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
         steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond
     )

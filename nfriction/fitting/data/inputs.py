@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.fitting.data.windows import begins_at_rest
+from nfriction.fitting.data.windows import begins_at_rest, moving_segments
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import (
     PlantParameter,
@@ -35,6 +35,7 @@ from nfriction.signals import Motion, count_seen, kalman_smoother
 from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
+Array = NDArray[np.float64]
 
 # Width of the smoothed sign of a model made by name, as a share of the slowest joint's largest
 # velocity: the default of 3 mrad/s (mm/s) if that velocity reaches 3 rad/s (m/s).
@@ -44,16 +45,20 @@ ALIKE = 0.02
 
 
 def as_model(
-    model: FrictionModel | str, joints: int, motions: Sequence[Motion] = ()
+    model: FrictionModel | str,
+    plant: Plant,
+    recordings: Sequence[Recording] = (),
+    motions: Sequence[Motion] = (),
 ) -> FrictionModel:
-    """The given model, or a new one by its name, with a smoothed sign that suits the motions.
+    """The given model, or a new one by its name, with a smoothed sign that suits the recordings.
 
     Raises:
         TypeError: for anything else.
         ValueError: if no model has that name.
     """
     if isinstance(model, str):
-        return model_by_name(model)(joints, v_smooth=turning_velocity(motions))
+        v_smooth = turning_velocity(plant, recordings, motions) if recordings else V_SMOOTH
+        return model_by_name(model)(plant.joints, v_smooth=v_smooth)
     if not isinstance(model, FrictionModel):
         raise TypeError(
             "`model` must be a friction model such as LFM(joints=3), or the name of one, got "
@@ -77,21 +82,61 @@ def require_doubles(model: torch.nn.Module, plant: torch.nn.Module) -> None:
                 )
 
 
-def turning_velocity(motions: Sequence[Motion]) -> float:
+def turning_velocity(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion]
+) -> float:
     """Width of the smoothed sign of the velocity [rad/s; m/s].
 
-    A joint that friction holds creeps at about this velocity, so it is a small share of the slowest
-    joint's largest velocity. It is at least the change of velocity in an integration step, because
-    friction would otherwise be too steep.
+    A joint that friction holds creeps at about this velocity. It is a small share of the slowest
+    joint's largest velocity, and in the longest rest it does not move a joint by more than noise
+    of its readings; but never so small that dry friction is too steep for the steps of a fit.
+
+    Args:
+        plant: the mechanism as given.
+        recordings: in joint coordinates.
+        motions: of the recordings, smoothed.
     """
-    if not motions:
-        return V_SMOOTH
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
-    taken = max(float(np.abs(m.qdd).max() * np.median(np.diff(m.time))) for m in motions)
-    # Half the substeps, because friction is not known yet.
-    least = taken / (RK4_STABILITY * DEFAULTS.max_substeps / 2)
-    return min(V_SMOOTH, max(TURN_SHARE * slowest, least))
+    pairs = list(zip(recordings, motions, strict=True))
+    creep = min(_creep(r, m, j) for r, m in pairs for j in range(plant.joints))
+    dry = plant.decay_rate(torch.as_tensor(_dry_friction(plant, pairs)))
+    # Half the substeps, because coefficients may grow during the search.
+    most = RK4_STABILITY * DEFAULTS.max_substeps / 2
+    least = float(dry.max()) * max(r.longest_step for r in recordings) / most
+    return max(min(V_SMOOTH, TURN_SHARE * slowest, creep), least)
+
+
+def _creep(recording: Recording, motion: Motion, joint: int) -> float:
+    """Velocity [rad/s; m/s] that moves a joint by the noise of a reading in its longest rest."""
+    noise = 3 * float(np.std(recording.q[:, joint] - motion.q[:, joint]))
+    if not noise:
+        return math.inf
+    longest = 0.0
+    for first, last in moving_segments(recording, motion):
+        span, q = recording.time[first : last + 1], motion.q[first : last + 1, joint]
+        # Halves of a cell, because a rest may lie on a border.
+        for shift in (0.0, 0.5):
+            moved = np.flatnonzero(np.diff(np.floor(q / (2 * noise) + shift)))
+            longest = max(longest, float(np.diff(span[[0, *moved, -1]]).max()))
+    return noise / longest
+
+
+def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Array:
+    """Dry friction of each joint that the torques imply [N m; N], (joint,)."""
+    qd, taken = (np.concatenate(x) for x in zip(*(_taken(plant, *p) for p in pairs), strict=True))
+    return np.array(
+        [
+            max(0.0, np.linalg.lstsq(np.stack([np.sign(v), v], 1), torque)[0][0])
+            for v, torque in zip(qd.T, taken.T, strict=True)
+        ]
+    )
+
+
+def _taken(plant: Plant, recording: Recording, motion: Motion) -> tuple[Array, Array]:
+    """Velocities, and the torques that the motion leaves to friction."""
+    needed = plant.inverse_dynamics(*map(torch.as_tensor, (motion.q, motion.qd, motion.qdd)))
+    return motion.qd, (0.0 if recording.tau is None else recording.tau) - needed.numpy()
 
 
 def as_recording_list(
@@ -279,12 +324,14 @@ def integration_substeps(
     """Integration steps per sample of at most `longest_step` [s]."""
     needed, most = required_substeps(plant, model, longest_step), options.max_substeps
     if needed > most:
-        logger.warning("near rest a sample needs %d integration steps, fits take %d", needed, most)
+        logger.warning(
+            "near rest a sample needs %d integration steps, fits take %d; use v_smooth >= %.2g "
+            "(now %.2g), or a model by its name, for which a fit chooses it",
+            needed, most, model.v_smooth * needed / most, model.v_smooth,
+        )  # fmt: skip
     # Twice the present need, because coefficients may grow during the search.
     return min(1 if needed == 1 else 2 * needed, most)
 
-
-Array = NDArray[np.float64]
 
 ZEROED_PER_RECORDING = (
     "Every recording begins at rest with all encoders at zero, so they are assumed to have been "
