@@ -17,21 +17,10 @@ from numpy.typing import NDArray
 
 from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
+from nfriction.fitting import torque_table
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.recorded import ripple_shift
 from nfriction.fitting.result.paired_test import gains
-from nfriction.fitting.torque_table import (
-    LEAD_IN,
-    JointFit,
-    fit_joint,
-    fit_memory,
-    fit_network,
-    join,
-    predict,
-    reads_load,
-    require_load,
-    turning_velocity,
-)
 from nfriction.friction import model_by_name, model_name, plain_name
 from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, Recorded, unused
 from nfriction.friction.models import FrictionModel
@@ -85,7 +74,7 @@ class TorqueFits:
     """
 
     table: TorqueTable
-    fits: Mapping[str, tuple[JointFit, ...]]
+    fits: Mapping[str, tuple[torque_table.JointFit, ...]]
     candidates: Mapping[str, tuple[Candidate, ...]]
     choices: Mapping[str, tuple[str, str]]
     failed: Mapping[str, str] = field(default_factory=dict)
@@ -109,7 +98,7 @@ class TorqueFits:
         Raises:
             ValueError: if it was not fitted.
         """
-        return join([found.model for found in self.fits[self._known(name)]])
+        return torque_table.join([found.model for found in self.fits[self._known(name)]])
 
     def _known(self, name: str) -> str:
         """The name under which a model was fitted."""
@@ -171,7 +160,7 @@ class TorqueFits:
         given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
         pairs = zip(self._models(model), given.joints, strict=True)
-        return [predict(one.model, joint).numpy() for one, joint in pairs]
+        return [torque_table.predict(one.model, joint).numpy() for one, joint in pairs]
 
     def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
@@ -309,8 +298,8 @@ def fit_torque(
     if folds < 2:
         raise ValueError(f"`folds` must be at least 2, got {folds}.")
     # One velocity for all joints, as a model file has one.
-    v_smooth = turning_velocity(given)
-    fits: dict[str, tuple[JointFit, ...]] = {}
+    v_smooth = torque_table.turning_velocity(given)
+    fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
     failed: dict[str, str] = {}
     for name in names:
@@ -344,7 +333,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     by_need: dict[tuple[bool, bool], list[Candidate]] = {}  # memory, load
     for candidate in candidates:
         kind = model_by_name(candidate.name)
-        need = kind.definition.memory is not None, reads_load(kind(1))
+        need = kind.definition.memory is not None, torque_table.reads_load(kind(1))
         by_need.setdefault(need, []).append(candidate)
     first, *others = sorted(by_need)
     chosen, why = _simplest(by_need[first])
@@ -387,37 +376,37 @@ def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
 
 def _fit(
     name: str, joint: JointTorque, v_smooth: float, folds: int, options: FitOptions
-) -> tuple[JointFit, Candidate]:
+) -> tuple[torque_table.JointFit, Candidate]:
     """A model fitted to all rows of a joint, and its errors on blocks left out."""
     model = model_by_name(name)(1)
     form = model.schedule.form
     # With fewer rows than folds, each row is left out once.
     folds = min(folds, len(joint))
     if model.law.memory is not None:
-        fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
+        fit, left_out = torque_table.fit_memory(name, joint, blocks(joint, folds), v_smooth)
         return fit, Candidate(name, left_out, len(fit.intervals) + fit.rules, True)
     if form not in ("constant", "neurofuzzy"):
         raise ValueError(
             f"{plain_name(name)} is not fitted to tables, which have no acceleration classes; use "
             "its law, or its neuro-fuzzy model."
         )
-    require_load(name, joint)
+    torque_table.require_load(name, joint)
     # The law without a network first: a network is kept only if it lowers the error.
     shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
         rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
         left = joint.rows(test)
-        constant = fit_joint(name, rest, v_smooth, options)
+        constant = torque_table.fit_joint(name, rest, v_smooth, options)
         for i, share in enumerate(shares):
-            found = fit_network(constant, rest, share, options) if share else constant
-            error = predict(found.model, left) - torch.as_tensor(left.tau)
+            found = torque_table.fit_network(constant, rest, share, options) if share else constant
+            error = torque_table.predict(found.model, left) - torch.as_tensor(left.tau)
             errors[i, k] = float(error.square().mean().sqrt())
     # Mean squares, so that blocks of equal length count as one table would.
     best = int(np.square(errors).mean(1).argmin())
-    found = fit_joint(name, joint, v_smooth, options)
+    found = torque_table.fit_joint(name, joint, v_smooth, options)
     if shares[best]:
-        found = fit_network(found, joint, shares[best], options)
+        found = torque_table.fit_network(found, joint, shares[best], options)
     # A dropped network has no parameters beyond its law's.
     count = int((found.model.schedule.parameter_vector() != 0).sum())
     count += len(found.model.law.coefficients) * (form != "constant")
@@ -430,10 +419,10 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     The lead-in of a law with memory is not scored, because the model was given its torque. A ripple
     that is out of phase with the rows is logged.
     """
-    torque, rows = predict(model, joint).numpy(), slice(None)
+    torque, rows = torque_table.predict(model, joint).numpy(), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # The initial deflection was estimated from the torque of these rows.
-        rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
+        rows = slice(int(np.searchsorted(joint.time, joint.time[0] + torque_table.LEAD_IN)), None)
     if isinstance(model.schedule, Recorded) and "ripple" in model.schedule.followed():
         shift = ripple_shift(model.schedule, joint, torque, blocks(joint, FOLDS))
         if shift:

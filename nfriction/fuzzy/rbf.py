@@ -6,21 +6,14 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
+from nfriction.fuzzy import grouped
 from nfriction.fuzzy.anfis import Anfis
-from nfriction.fuzzy.grouped import (
-    GroupedModule,
-    LinearOutputModule,
-    input_range,
-    ridge,
-    to_columns,
-    to_rows,
-)
 
 # Numbers of evenly thinned candidates and samples for orthogonal least squares.
 _CANDIDATES, _SAMPLES = 500, 5000
 
 
-class RBFNetwork(LinearOutputModule):
+class RBFNetwork(grouped.LinearOutputModule):
     """Gaussian units with one width per axis and a linear output layer, with groups stacked.
 
     `y = output_weight · exp(-Σ_i ((x_i - c_i)/s_i)^2 / 2) + output_bias`. A new network has
@@ -79,11 +72,11 @@ class RBFNetwork(LinearOutputModule):
     def forward(self, x: Tensor) -> Tensor:
         """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
         y = torch.baddbmm(self.output_bias.unsqueeze(-1), self.output_weight, self._activations(x))
-        return to_rows(y, x)
+        return grouped.to_rows(y, x)
 
     def activations(self, x: Tensor) -> Tensor:
         """Outputs of the Gaussian units, shape (*batch, groups, units)."""
-        return to_rows(self._activations(x), x)
+        return grouped.to_rows(self._activations(x), x)
 
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
@@ -107,7 +100,7 @@ class RBFNetwork(LinearOutputModule):
         Returns:
             Shape (groups, units + 1 + 2 units inputs, samples).
         """
-        columns, shared = to_columns(x), self.units + 1
+        columns, shared = grouped.to_columns(x), self.units + 1
         shape = (len(columns), shared + 2 * self.units * self.inputs, columns.shape[-1])
         F = columns.new_empty(shape) if out is None else out
         moving = F[:, shared:].unflatten(1, (2, self.units, self.inputs))
@@ -159,7 +152,7 @@ class RBFNetwork(LinearOutputModule):
         Returns:
             Shapes (groups, units, 1), (groups, units, 2 inputs) and (groups, 2 inputs, samples).
         """
-        columns = to_columns(x)
+        columns = grouped.to_columns(x)
         # Expanding about zero would cancel digits for inputs far from it.
         middle = self.centres.mean(1)
         offset = self.centres - middle.unsqueeze(1)
@@ -178,7 +171,7 @@ class RBFNetwork(LinearOutputModule):
             lower, upper: range of each input, broadcastable to (groups, inputs).
             seed: of the random draw.
         """
-        low, high = input_range(lower, upper, self.centres[:, 0].detach())
+        low, high = grouped.input_range(lower, upper, self.centres[:, 0].detach())
         low, span = low.unsqueeze(1), (high - low).unsqueeze(1)
         random = torch.Generator().manual_seed(seed)
         drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(low)
@@ -228,7 +221,7 @@ class RBFNetwork(LinearOutputModule):
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
         targets = y.reshape(-1, self.groups, self.outputs)
-        layer = ridge(features, targets, prior_precision).mT
+        layer = grouped.ridge(features, targets, prior_precision).mT
         self.output_weight.copy_(layer[..., :-1])
         self.output_bias.copy_(layer[..., -1])
 
@@ -243,7 +236,7 @@ class RBFNetwork(LinearOutputModule):
         return samples
 
 
-class AnfisRBF(GroupedModule):
+class AnfisRBF(grouped.GroupedModule):
     """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
 
     The ANFIS provides the main fit and the head refines it; the output of a new head is zero.
@@ -288,7 +281,7 @@ class AnfisRBF(GroupedModule):
         """
         self.anfis.init_grid(lower, upper)
         centres = self.head.centres[:, 0].detach()
-        low, high = input_range(lower, upper, centres[:, : self.inputs])
+        low, high = grouped.input_range(lower, upper, centres[:, : self.inputs])
         ones = torch.ones_like(centres[:, self.inputs :])
         self.head.init_range(torch.cat([low, -ones], 1), torch.cat([high, ones], 1), seed)
 

@@ -12,35 +12,20 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from nfriction.simulation import protocols, validate
 from nfriction.simulation.adjoint import adjoint_rollout, wants_gradients
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.memory_step import memory_of, memory_step
-from nfriction.simulation.protocols import (
-    Friction,
-    NoFriction,
-    Plant,
-    Rollout,
-    RolloutInputs,
-    StepFunction,
-    with_sample_time,
-)
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
-from nfriction.simulation.validate import (
-    outside_inference_mode,
-    require_stability,
-    validate_inputs,
-    validate_measured,
-    with_states,
-)
 
 Scheme = Literal["rk4", "time_stepping"]
 
 
-@outside_inference_mode
+@validate.outside_inference_mode
 def rollout(
-    plant: Plant,
-    friction: Friction | None,
+    plant: protocols.Plant,
+    friction: protocols.Friction | None,
     q0: Tensor,
     qd0: Tensor,
     tau: Tensor | None = None,
@@ -56,7 +41,7 @@ def rollout(
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
-) -> Rollout:
+) -> protocols.Rollout:
     """Simulate a plant with friction from an initial state.
 
     Models from `fit` and `load` require no gradients and are compiled, thousands of times faster
@@ -99,40 +84,44 @@ def rollout(
             a stable integration, or the scheme does not support an option.
         CodegenError: if `backend="compiled"` and the model cannot be compiled.
     """
-    model = NoFriction(plant.joints) if friction is None else friction
-    inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
-    inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
-    model = with_sample_time(model, inputs.step)
-    inputs = with_states(inputs, model, hidden_state, law_state)
+    model = protocols.NoFriction(plant.joints) if friction is None else friction
+    inputs = validate.validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
+    inputs = replace(inputs, measured=validate.validate_measured(drive, measured, inputs))
+    model = protocols.with_sample_time(model, inputs.step)
+    inputs = validate.with_states(inputs, model, hidden_state, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
-        return Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
+        return protocols.Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
     system = System.of(plant, model)
-    require_stability(system, inputs)
+    validate.require_stability(system, inputs)
     if gradients is None:
         gradients = backend != "compiled" and wants_gradients(inputs, system.tensors.values())
     states = simulate(system, inputs, gradients, backend, threads)
-    return Rollout.of(inputs, states)
+    return protocols.Rollout.of(inputs, states)
 
 
-def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
+def integrate(
+    plant: protocols.Plant, friction: protocols.Friction | None, inputs: protocols.RolloutInputs
+) -> protocols.Rollout:
     """`rollout` without checks and gradients, for searches whose trials may be unstable."""
-    model = NoFriction(plant.joints) if friction is None else friction
-    inputs = with_states(inputs, model, inputs.hidden_state, inputs.law_state)
-    return Rollout.of(inputs, simulate(System.of(plant, model), inputs))
+    model = protocols.NoFriction(plant.joints) if friction is None else friction
+    inputs = validate.with_states(inputs, model, inputs.hidden_state, inputs.law_state)
+    return protocols.Rollout.of(inputs, simulate(System.of(plant, model), inputs))
 
 
 def simulate(
     system: System,
-    inputs: RolloutInputs,
+    inputs: protocols.RolloutInputs,
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
 ) -> tuple[Tensor, ...]:
     """States q, qd, qdd, each (*batch, steps + 1, joint), from the backend that supports them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
-    step_function: StepFunction = rk4_step if memory_of(system.friction) is None else memory_step
+    step_function: protocols.StepFunction = (
+        rk4_step if memory_of(system.friction) is None else memory_step
+    )
     states = None
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":

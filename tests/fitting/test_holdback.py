@@ -166,7 +166,7 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
         # Better on some windows, worse on others.
         return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model

@@ -137,9 +137,9 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
         made.append(Contest(task, start, **rival))
         return made[-1]
 
-    monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: (gains, start))
+    monkeypatch.setattr(neurofuzzy.inputs, "chosen_inputs", lambda task, start: (gains, start))
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
-    monkeypatch.setattr(neurofuzzy, "drives", lambda found, own: driving and own == 2)
+    monkeypatch.setattr(neurofuzzy.inputs, "drives", lambda found, own: driving and own == 2)
     plain = Contest(task, "law")
     chosen, best = neurofuzzy._with_chosen_inputs(plain)
     (found,) = made

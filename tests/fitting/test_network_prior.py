@@ -64,7 +64,7 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
         found = seen[-1] == pytest.approx(0.6 * PRIOR_SHARES[best])
         return torch.full((len(test),), 0.5 - 0.2 * found)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, one_link(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     tried = len(PRIOR_SHARES)
@@ -89,7 +89,7 @@ def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
             return torch.full((len(test),), longer if long else 0.5).square()
         return torch.full((len(test),), 2.0 if long else 1.0).square()
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", rms)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", rms)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     found = fit(model, one_link(), recording, start=law, **BRIEF, fit_plant=False)
     assert bool(model.schedule.parameter_vector().any()) is kept
@@ -124,7 +124,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
         learns = isinstance(problem.friction.schedule, NeuroFuzzy)
         return torch.full((len(test),), 0.5 if learns else 1.0)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
 
     def moved() -> float:
         """By how many standard deviations that the law's fit left open, at most."""
@@ -170,7 +170,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
         return searched(self, problem, start, *others)
 
     searched = ShootingFitter.search
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     fit(model, one_link(), recording, start=law, **BRIEF)
@@ -203,7 +203,7 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
         return searched(self, problem, *others)
 
     searched = ShootingFitter.search
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
     fit(NFLFM(1, v_smooth=V_SMOOTH, **SMALL), one_link(), recording, start=law, **BRIEF)
     free, near = trained[0], trained[DEFAULTS.folds]

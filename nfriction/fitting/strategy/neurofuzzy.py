@@ -29,6 +29,7 @@ from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
+from nfriction.fitting.strategy import holdout, inputs
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import (
     HorizonResult,
@@ -37,22 +38,6 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
-from nfriction.fitting.strategy.holdout import (
-    StoppedError,
-    holdout_splits,
-    holdout_squares,
-    holdout_windows,
-    verdict,
-)
-from nfriction.fitting.strategy.inputs import (
-    InputGain,
-    chosen_inputs,
-    drives,
-    longest_duration,
-    seeing_plant,
-    widened_fitter,
-    widened_start,
-)
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -80,7 +65,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
     given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
-    task = replace(task, plant=seeing_plant(task.plant, given))
+    task = replace(task, plant=inputs.seeing_plant(task.plant, given))
     heated, own = is_heated(task.model.law), task
     if heated:
         law = cast("NeuroFuzzyModel", task.model).definition
@@ -91,20 +76,20 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
     aligned = replace(task, recordings=recordings, motions=motions)
-    widened = widened_start(aligned, start, given) if heated else start
+    widened = inputs.widened_start(aligned, start, given) if heated else start
     if widened is None:
-        fitter = widened_fitter(aligned, start, given, longest_duration(motions))
+        fitter = inputs.widened_fitter(aligned, start, given, inputs.longest_duration(motions))
         start = replace(start, model=fitter.friction)
     contest = _Contest(aligned, widened or start)
-    chosen: tuple[InputGain, ...] = ()
+    chosen: tuple[inputs.InputGain, ...] = ()
     model = task.model
     try:
         if widened is None:
-            raise StoppedError
+            raise holdout.StoppedError
         contest.train()
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
-    except StoppedError:
+    except holdout.StoppedError:
         if contest.best is not None:
             contest.best = replace(contest.best, end=contest.best.end.as_stopped())
     if chosen:
@@ -120,16 +105,16 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
-def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
+def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:
     """Inputs that improve law and network on hold-out windows (or none), and their contest."""
     task = plain.task
-    chosen, start = chosen_inputs(task, plain.start)
+    chosen, start = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
     names = [gain.name for gain in chosen]
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
-    seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
+    seeing = replace(task, model=model, plant=inputs.seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
     if not gains(rival.validation.of_law, plain.validation.of_law):
         return (), plain
@@ -137,7 +122,7 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     if not gains(rival.squares, plain.squares):
         return (), plain
     # Friction of the constant law may drive a joint even if that of its network does not.
-    return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
+    return ((), plain) if inputs.drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
 
 class _Contest:
@@ -206,10 +191,10 @@ class _Contest:
             if self.accepts(best) and not end.stopped:
                 end = validation.fit_all(best)
                 note = validation.lost_by(end)
-        except StoppedError:
+        except holdout.StoppedError:
             end = best.end.as_stopped()
         if not self.accepts(best):
-            note = verdict(best.squares, validation.of_law)
+            note = holdout.verdict(best.squares, validation.of_law)
         if note:
             return self._kept(model, note, converged=not end.stopped)
         found = copy.deepcopy(end.problem.friction)
@@ -371,8 +356,8 @@ class Validation:
         assert law.plant_prior is not None
         self.law, self.motions, self.length, self.options = law, motions, length, law.options
         self.plant = law.plant_prior[0]
-        self.windows = holdout_windows(law.recordings, motions, length, self.options.folds)
-        self.splits = holdout_splits(self.windows, self.options.folds)
+        self.windows = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
+        self.splits = holdout.holdout_splits(self.windows, self.options.folds)
         # The noise that sets the weight of the priors is the residual of the constant law at the
         # same horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
@@ -452,7 +437,7 @@ class Validation:
             tolerance = self.options.evidence_gain / max(float(problem.cost(x)), 1.0)
             end = fitter.search(problem, x, tolerance, "network's sets, hold-out")
             if end.stopped:
-                raise StoppedError
+                raise holdout.StoppedError
             found = replace(trial, fitter=fitter, end=end, tolerance=tolerance)
             gain = log_evidence(found.end) - (log_evidence(best.end) if best else -math.inf)
             if not gain > self.options.evidence_gain:
@@ -474,9 +459,9 @@ class Validation:
         if end.stopped or windows.spans == self.windows.spans:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
-        network = holdout_squares(windows, end.problem, friction, plant)
+        network = holdout.holdout_squares(windows, end.problem, friction, plant)
         problem = self.law.problem(windows, self.noise, law)
-        ratio = network.mean() / holdout_squares(windows, problem, law, self.plant).mean()
+        ratio = network.mean() / holdout.holdout_squares(windows, problem, law, self.plant).mean()
         worse = 100 * (float(ratio.sqrt()) - 1)
         return LOST.format(windows.length, worse) if worse > 0 else ""
 
@@ -503,9 +488,9 @@ class Validation:
     def _errors(self, end: HorizonResult, place: int = 0) -> Tensor:
         """Squared errors of a search on the windows that a split holds out, (window,)."""
         if end.stopped:
-            raise StoppedError
+            raise holdout.StoppedError
         friction, plant, *_ = end.parts
-        squares = holdout_squares(self.splits[place][1], end.problem, friction, plant)
+        squares = holdout.holdout_squares(self.splits[place][1], end.problem, friction, plant)
         return squares.clamp_min(self.explained**2)
 
 
