@@ -563,6 +563,8 @@ def test_a_fit_says_whether_it_is_usable():
     # Turns in plenty excuse no error of the angle.
     turning = tuple(replace(m, q=50 * m.q) for m in wrong.motions)
     assert replace(wrong, motions=turning).usability[0] == "doubtful"
+    # Without gravity all angles are alike, and a wheel that turns often has moved far.
+    assert replace(wrong, motions=turning, plant=Rotor(0.01)).usability[0] == "good"
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
