@@ -575,12 +575,14 @@ def _of_sliding(plant: Plant, data: _Data, j: int, options: FitOptions) -> tuple
     static, needed = plant.inverse_dynamics(data.q, rest, rest), data.needed(plant)
     speed, ones = data.qd[:, j].abs(), torch.ones_like(data.qd[:, j])
     knots = torch.quantile(speed, torch.linspace(0, 1, SPEED_KNOTS, dtype=speed.dtype))
-    shapes = [ones, *((speed - knot).clamp_min(0) for knot in knots[:-1]), data.tau[:, j].abs()]
+    torque = data.tau[:, [j]]
+    # A gear's loss, with the load: where friction is most of the torque, the torque times the
+    # direction is the torque itself, and would explain everything.
+    carried = needed[:, j].abs() * torque.any()
+    shapes = [ones, *((speed - knot).clamp_min(0) for knot in knots[:-1]), carried]
     friction = torch.stack([torch.sign(data.qd[:, j]) * shape for shape in shapes], 1)
     rate = needed[:, j].reshape(-1, data.block).diff(dim=1).mean(1)
-    late = rate.repeat_interleave(data.block)
-    of_rig = torch.stack([ones, static[:, j], late, needed[:, j]], 1)
-    torque = data.tau[:, [j]]
+    of_rig = torch.stack([ones, static[:, j], rate.repeat_interleave(data.block), needed[:, j]], 1)
     if not torque.any():
         of_rig, torque = of_rig[:, :-1], -needed[:, [j]]
     # Smoothed over a reversal, dry friction seems to depend on the acceleration.

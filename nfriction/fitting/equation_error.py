@@ -300,7 +300,12 @@ class _Regression:
             design = torch.cat([p.smoothed(c) for p, c in zip(self.parts, columns, strict=True)])
             candidates.append(self._linear_fit(design, fixed))
         starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
-        best = residuals.argmin(0)
+        # No prior would let a peak narrower than the slowest sample have any height.
+        many, least = self.kept.sum(0), residuals.amin(0)
+        size = ((self.root * self.torque).square().sum(0) / many).sqrt()
+        sd = prior_sd(law, TorqueFit(starts[0], least, size), self.options)
+        noise = torch.maximum(least, ROUNDING * size) / many.sqrt()
+        best = (residuals.square() + (noise[:, None] * starts / sd).square().sum(-1)).argmin(0)
         coefficients = starts[best, torch.arange(len(best))]
         if any(c.fitted for c in law.coefficients if not c.linear):
             coefficients = self.refined(coefficients)
@@ -384,8 +389,7 @@ def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int
     columns = []
     for i in linear:
         unit = torch.zeros(*qd.shape, len(law.coefficients), dtype=qd.dtype)
-        unit[..., i] = 1.0
-        for k, value in fixed.items():
+        for k, value in {i: 1.0, **fixed}.items():
             unit[..., k] = value
         columns.append(law.torque(qd, load, unit, v_smooth))
     design = torch.stack(columns, -1)
@@ -421,10 +425,7 @@ def coefficient_scale(
 
 
 def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Tensor:
-    """Standard deviation of the law's zero-mean priors in SI, (joint, coefficient).
-
-    Infinite without a prior; scaled by the torque that the law explains.
-    """
+    """Width of the law's zero-mean priors in SI, (joint, coefficient); infinite for no prior."""
     shares = torch.tensor([c.prior_scale for c in law.coefficients], dtype=torque.torque.dtype)
     # On a light mechanism most of the torque consists of errors of inertia terms and smoothing.
     explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()

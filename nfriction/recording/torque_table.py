@@ -211,7 +211,8 @@ class TorqueTable:
                         f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, "
                         "unwrap it with `numpy.unwrap`."
                     )
-        if unit == "rad" and not degrees:
+        stated = any(named for (key, _), (_, named) in sources.items() if key in ("q", "qd"))
+        if unit == "rad" and not (degrees or stated):
             fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
             if fast:
                 remarks.append(

@@ -128,6 +128,16 @@ def test_of_few_rows_each_is_left_out_once() -> None:
     assert 0 < found.to_frame().loc["joint1", "CVFM"] < 0.02
 
 
+def test_a_peak_below_the_slowest_velocity_is_no_higher_than_the_friction() -> None:
+    qd = np.repeat([-2.0, -1.0, -0.5, 0.5, 1.0, 2.0], 40)
+    truth = np.sign(qd) * (1.2 + 0.5 / (1 + (qd / 0.3) ** 2)) + 0.35 * qd
+    for sd in (0.0, 0.05):
+        tau = truth + sd * np.random.default_rng(0).normal(size=240)
+        (joint,) = TorqueTable.from_pandas(pd.DataFrame({"qd": qd, "tau": tau})).joints
+        coulomb, peak, *_ = fit_joint("stribeck", joint, 1e-3).model.schedule.values[0].tolist()
+        assert coulomb + peak < 2.2
+
+
 def test_every_file_of_a_run_predicts_as_the_fit_does(tmp_path: Path) -> None:
     table = two_joints()
     models = "coulomb-viscous,load-coulomb,stribeck,neuro-fuzzy:coulomb"

@@ -23,7 +23,7 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting.diagnosis import loose_loads
+from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
@@ -176,6 +176,22 @@ def test_a_friction_that_changes_within_a_recording_is_named(change):
     assert way == ("grows" if change > 0 else "falls")
     start, end = 1 - change / 2, 1 + change / 2
     assert abs(float(found) - 100 * abs(end / start - 1)) < float(within) + 1 < 20
+
+
+@pytest.mark.parametrize("fall", [0.0, 0.2])
+def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall):
+    rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
+    phase, rng = rate * time, np.random.default_rng(0)
+    q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)
+    q, qd, qdd = (x.sum(1, keepdims=True) for x in (q, qd, qdd))
+    tau = 3.5 * qdd + (1 - fall * time / time[-1]) * (12 * np.sign(qd) + 15 * qd)
+    q += 1e-5 * rng.normal(size=q.shape)
+    tau += 0.1 * rng.normal(size=q.shape)
+    recording = Recording(time[:, 0], q, tau, unit="m")
+    motions = [kalman_smoother(recording.time, recording.q)]
+    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert len(said) == (fall > 0)
+    assert all("falls by 20 % (within" in sentence for sentence in said)
 
 
 @pytest.mark.parametrize("chirp", [True, False])
@@ -569,6 +585,8 @@ def test_a_fit_says_whether_it_is_usable():
     # Turns in plenty excuse no error of the angle.
     turning = tuple(replace(m, q=50 * m.q) for m in wrong.motions)
     assert replace(wrong, motions=turning).usability[0] == "doubtful"
+    # Without gravity all angles are alike, and a wheel that turns often has moved far.
+    assert replace(wrong, motions=turning, plant=Rotor(0.01)).usability[0] == "good"
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None

@@ -109,6 +109,7 @@ def test_doubts_are_remarked() -> None:
     assert "one direction only" in one_way.remarks[0]
     fast = TorqueTable.from_pandas(table(qd=np.rad2deg(2 * QD)))
     assert "degrees per second" in fast.remarks[0]
+    assert not TorqueTable.from_pandas(table(qd=1e3 * QD), columns={"qd": "qd:rpm"}).remarks
     assert not TorqueTable.from_pandas(table()).remarks
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY
-from nfriction.fitting.data.inputs import advanced_torques
+from nfriction.fitting.data.inputs import advanced_torques, weighs
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
@@ -161,8 +161,8 @@ class FitResult:
         """
         noise = math.inf if self.noise is None else self.noise
         moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
-        # A joint that keeps turning over can be anywhere on its circle.
-        most = UNIFORM_TURN**2 if self.plant.unit == "rad" else math.inf
+        # A joint that keeps turning over under gravity can be anywhere on its circle.
+        most = UNIFORM_TURN**2 if weighs(self.plant) else math.inf
         motion = math.sqrt(np.minimum(moved, most).mean())
         above = self.residual > DEFAULTS.model_error_ratio * noise
         wrong = above and self.residual > DOUBTFUL_ERROR * motion
