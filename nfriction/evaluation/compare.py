@@ -1,7 +1,7 @@
 """Compare friction models: fit each to training recordings, score it on test recordings."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -65,6 +65,7 @@ class Comparison:
         joint_names: columns of the tables.
         horizons_asked: requested window lengths of the scores [s].
         failed: reason why a model was not fitted, by its name.
+        test_warnings: of the test recordings, a sentence each.
     """
 
     fits: dict[str, FitResult]
@@ -74,6 +75,7 @@ class Comparison:
     joint_names: tuple[str, ...]
     horizons_asked: tuple[float, ...] = ()
     failed: dict[str, str] = field(default_factory=dict)
+    test_warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """The best model, and the free-run errors by model and joint."""
@@ -312,6 +314,7 @@ class Comparison:
             "schema": SCHEMA,
             "models": models,
             **({"failed": dict(self.failed)} if self.failed else {}),
+            **({"test_warnings": list(self.test_warnings)} if self.test_warnings else {}),
             "best": judged,
             **({"unfit": unfit} if (unfit := self.unfit()) else {}),
             "units": self.unit,
@@ -377,11 +380,11 @@ def compare(
         Data(part, [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in part])
         for part in (train, test)
     )
-    _warn_of_faster(plant, data, tested)
+    warned = _warned(_faster(plant, data, tested))
     fits, failed = fit_models(
         plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
     )["fit"]
-    _warn_of_mistakes(plant, next(iter(fits.values())), data, tested)
+    warned += _warned(_mistakes(plant, next(iter(fits.values())), data, tested))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
@@ -401,24 +404,29 @@ def compare(
         progress.done()
     return Comparison(
         Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
-        horizons_asked=tuple(horizons), failed=failed,
+        horizons_asked=tuple(horizons), failed=failed, test_warnings=warned,
     )  # fmt: skip
 
 
-def _warn_of_mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> None:
-    """Warn of likely mistakes in test recordings, unless the fit names some in its own."""
+def _warned(texts: Iterable[str]) -> tuple[str, ...]:
+    found = tuple(texts)
+    for text in found:
+        warnings.warn(text, stacklevel=1)
+    return found
+
+
+def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator[str]:
+    """Likely mistakes in test recordings, unless the fit names some in its own."""
     known, both = {*finer_counts(plant, train.recordings)}, [*train.recordings, *test.recordings]
-    found = [text for text in finer_counts(plant, both) if text not in known]
+    yield from (text for text in finer_counts(plant, both) if text not in known)
     for recording, moved in () if fit.mistakes else zip(*test, strict=True):
         joint = fit.aligned(recording.joint_coordinates(plant))
         mistakes = likely_mistakes(plant, [joint], [moved], recording.resolve_convention(plant))
-        found += [f"{recording.name or 'test'}: {text}" for text in mistake_warning(*mistakes)]
-    for text in found:
-        warnings.warn(text, stacklevel=1)
+        yield from (f"{recording.name or 'test'}: {text}" for text in mistake_warning(*mistakes))
 
 
-def _warn_of_faster(plant: Plant, train: Data, test: Data) -> None:
-    """Warn of test recordings faster than all training recordings: friction is extrapolated."""
+def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
+    """A sentence if test recordings are faster than all training recordings."""
     fastest, found = np.max([np.abs(m.qd).max(0) for m in train.motions], axis=0), []
     for recording, moved in zip(*test, strict=True):
         # Pure noise exceeds other pure noise in half of all cases.
@@ -431,10 +439,9 @@ def _warn_of_faster(plant: Plant, train: Data, test: Data) -> None:
             if speed > known
         ]
     if found:
-        warnings.warn(
-            f"friction is extrapolated to speeds that no training recording reaches: "
-            f"{', '.join(found)}; train on motions as fast as those to be simulated.",
-            stacklevel=1,
+        yield (
+            "friction is extrapolated to speeds that no training recording reaches: "
+            f"{', '.join(found)}; train on motions as fast as those to be simulated."
         )
 
 

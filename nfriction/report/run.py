@@ -161,11 +161,14 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     fits = {name: FitRecord.of(entry["fit"]) for name, entry in entries.items() if "fit" in entry}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = _figures(folder / "figures")
-    failed = content.get("failed", {})
+    comparison = Comparison(
+        {}, scores["train"], scores["test"], unit, joints, failed=content.get("failed", {}),
+        test_warnings=tuple(content.get("test_warnings", ())),
+    )  # fmt: skip
     return Run(
         id=content.get("run", ""),
         folder=folder,
-        comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
+        comparison=comparison,
         fits=fits,
         coefficients={
             name: _coefficients(entry["coefficients"])

@@ -164,7 +164,8 @@ def test_a_mistake_in_a_test_recording_is_named(recwarn):
     with pytest.warns(
         UserWarning, match=r"b: A mistake .* likely: joint2's position is 90 degrees"
     ):
-        compare(pendulum(), "NCFM", A, off, **settings)
+        found = compare(pendulum(), "NCFM", A, off, **settings)
+    assert "90 degrees" in found.to_dict()["test_warnings"][0]
     small = dataclasses.replace(B, q=np.deg2rad(B.q))
     with pytest.warns(UserWarning, match=r"joint1 changes by 1.34e-05 rad in b, by at least"):
         compare(pendulum(), "NCFM", A, small, **settings)
