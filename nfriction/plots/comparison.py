@@ -19,15 +19,9 @@ from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names
-from nfriction.plots import style
+from nfriction.plots import neurofuzzy, style
 from nfriction.plots.drawing import mechanism
 from nfriction.plots.friction_torque import torque_over_velocity
-from nfriction.plots.neurofuzzy import (
-    coefficient_sections,
-    coefficient_surfaces,
-    coefficients_over_time,
-    memberships,
-)
 from nfriction.recording import Recording
 
 Array = NDArray[np.float64]
@@ -410,10 +404,13 @@ def _figures(
     # Constants along the motion are worth drawing only with coefficients that follow it.
     moving = [m for m in models.values() if "always" not in m.schedule.coefficient_sets()]
     for law in dict.fromkeys(model.law.name for model in moving):
-        yield f"over_time_{law}", coefficients_over_time(models, moved[0], law=law, **labels)
+        yield (
+            f"over_time_{law}",
+            neurofuzzy.coefficients_over_time(models, moved[0], law=law, **labels),
+        )
     for name, found in comparison.fits.items():
         if (rules := found.model.schedule.fuzzy_rules()) is not None and not rules.constant:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
-            yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
-            yield f"sections_{name}", coefficient_sections(found.model, **known)
-            yield f"memberships_{name}", memberships(found.model, **labels)
+            yield f"coefficients_{name}", neurofuzzy.coefficient_surfaces(found.model, **known)
+            yield f"sections_{name}", neurofuzzy.coefficient_sections(found.model, **known)
+            yield f"memberships_{name}", neurofuzzy.memberships(found.model, **labels)

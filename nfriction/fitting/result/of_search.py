@@ -23,14 +23,9 @@ from nfriction.fitting.result.identifiability import (
     weakly_identified,
 )
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
+from nfriction.fitting.shooting import uncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.shooting.uncertainty import (
-    encoder_count,
-    gathered_information,
-    integration_error,
-    measurement_noise,
-)
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
@@ -125,7 +120,7 @@ def result_from_shooting(
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())
     outliers = tuple(outliers_of(problem, weights))
-    noise = measurement_noise(problem, x, residual)
+    noise = uncertainty.measurement_noise(problem, x, residual)
     intervals, unidentifiable, root = _identifiability(
         problem, result, names, residuals * weights, motions, ambiguous
     )
@@ -250,7 +245,7 @@ def _identifiability(
     """
     constant = not problem.friction.schedule.follows_motion
     if (belief := problem.friction.schedule.belief()) is None:
-        off = integration_error(problem, result)
+        off = uncertainty.integration_error(problem, result)
     else:
         problem, off = _by_data(problem, result.x, belief)
     variables, options = problem.variables, problem.options
@@ -263,10 +258,10 @@ def _identifiability(
         return (), tuple(fitted_names) if constant else (), None
     sd = hac_sd(residuals, bandwidth(problem.windows.q, options), options)
     # Below breakaway a contact returns to the same positions, so the rounding recurs at any lag.
-    quantum = encoder_count(problem) if problem.friction.law.memory else None
+    quantum = uncertainty.encoder_count(problem) if problem.friction.law.memory else None
     rms = float(residuals.square().mean().sqrt())
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
-    known = gathered_information(problem, result.x, sd, quantum if rounded else None)
+    known = uncertainty.gathered_information(problem, result.x, sd, quantum if rounded else None)
     known = known.subset(fitted)
     root = torch.zeros(count, len(fitted) + 1, dtype=torch.float64)
     root[fitted] = torch.cat([covariance_root(known), off[fitted, None]], 1)
