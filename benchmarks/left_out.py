@@ -227,7 +227,7 @@ class Contest:
             start = time.process_time()
             before = fits.get(origin[m])
             fits[m] = found = fit(
-                model_by_name(m)(plant.joints), plant, fold.fitted, start=before,
+                m, plant, fold.fitted, start=before,
                 motions=before.motions if before else None,
                 encoder_reference=self.of.encoder_reference, **self.settings,
             )  # fmt: skip

@@ -58,8 +58,7 @@ def own_rigs(seeds: int, rigs: int) -> None:
         number = int(of.name.split()[-1])
         begun = time.perf_counter()
         recordings = recorded(of, number)
-        model = model_by_name(of.law)(of.plant.joints)
-        found = fit(model, of.given, recordings)
+        found = fit(of.law, of.given, recordings)
         for line, verdict in judged(of, found):
             counts[verdict] += 1
             print(f"{of.name:28} {line}  {verdict}", flush=True)

@@ -81,7 +81,7 @@ def test_scores_use_the_fitted_delay():
 def test_gradient_by_the_delay_is_that_of_the_cost():
     recording, axis = delayed(), LinearAxis(2.0)
     options = FitOptions(fit_delay=True)
-    terms = adjustable_terms(axis, [recording], options)
+    terms = adjustable_terms(axis, CVFM(1).law, [recording], options)
     motion = kalman_smoother(recording.time, recording.q)
     windows = cut_windows([recording], [motion], 0.5)
     problem = ShootingProblem(

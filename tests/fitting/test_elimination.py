@@ -48,7 +48,7 @@ def swings(seconds, length, friction, start, recordings=1, **settings):
     motions = [kalman_smoother(r.time, r.q) for r in made]
     each = settings.get("offset_sd") is not None
     options = FitOptions(drag=False)
-    terms = adjustable_terms(plant, made, options, per_recording=each)
+    terms = adjustable_terms(plant, LFM(2).law, made, options, per_recording=each)
     measurement = measurement_matrix(plant, made[0].resolve_convention(plant))
     jacobian = StepJacobian(plant, law, terms)
     search = ShootingFitter(jacobian, law, made, measurement, options, **settings)

@@ -106,6 +106,16 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
 
 
+def test_a_constant_force_is_the_offset_of_a_law_that_has_one():
+    """Beside a term of the plant only their sum would be identifiable."""
+    truth = LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)
+    recording = driven_axis(LinearAxis(2.0, torque_offset=0.3), truth)
+    found = fit(NLFM(1, v_smooth=V_SMOOTH), LinearAxis(1.9), recording, windows=(0.5,))
+    assert float(found.model.schedule.values[0, 0]) == pytest.approx(-0.3, rel=0.05)
+    assert not any("offset" in name for name, *_ in found.plant_terms)
+    assert not any("f_o" in text for text in found.unidentifiable)
+
+
 @pytest.mark.parametrize(("mass", "viscous", "v_smooth"), [(20.0, 20.0, 2e-5), (0.02, 0.05, 1e-3)])
 def test_the_sign_of_a_named_model_suits_speeds_and_steps(mass, viscous, v_smooth):
     """A heavy axis moves at 6 cm/s; friction stops a light one within a few samples."""
@@ -184,7 +194,7 @@ def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
     recording = swing(pendulum(), true_model(), seconds=1.0)
 
     def drag(**more):
-        terms = adjustable_terms(pendulum(), [recording], FitOptions(**more))
+        terms = adjustable_terms(pendulum(), LFM(2).law, [recording], FitOptions(**more))
         return [term.name for term in terms if "drag" in term.name]
 
     assert drag() == ["drag linear", "drag quadratic", "drag reach"]

@@ -79,7 +79,7 @@ def test_the_noise_of_the_torque_counts_once(monkeypatch):
     """A fine encoder shows nothing else, so residuals add nothing to what is drawn."""
     tasks, drawn = [], uncertainty.gathered_information
     monkeypatch.setattr(
-        "nfriction.fitting.result.of_search.gathered_information",
+        "nfriction.fitting.shooting.uncertainty.gathered_information",
         lambda *task: tasks.append(task) or drawn(*task),
     )
     recording = flywheel(0, CVFM(1, [0.35, 0.12]), counts=2**18)

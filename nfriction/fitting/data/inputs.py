@@ -90,11 +90,7 @@ def turning_velocity(
     A joint that friction holds creeps at about this velocity. It is a small share of the slowest
     joint's largest velocity, and in the longest rest it does not move a joint by more than noise
     of its readings; but never so small that dry friction is too steep for the steps of a fit.
-
-    Args:
-        plant: the mechanism as given.
-        recordings: in joint coordinates.
-        motions: of the recordings, smoothed.
+    Recordings are in joint coordinates.
     """
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
@@ -124,19 +120,13 @@ def _creep(recording: Recording, motion: Motion, joint: int) -> float:
 
 def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Array:
     """Dry friction of each joint that the torques imply [N m; N], (joint,)."""
-    qd, taken = (np.concatenate(x) for x in zip(*(_taken(plant, *p) for p in pairs), strict=True))
-    return np.array(
-        [
-            max(0.0, np.linalg.lstsq(np.stack([np.sign(v), v], 1), torque)[0][0])
-            for v, torque in zip(qd.T, taken.T, strict=True)
-        ]
-    )
-
-
-def _taken(plant: Plant, recording: Recording, motion: Motion) -> tuple[Array, Array]:
-    """Velocities, and the torques that the motion leaves to friction."""
-    needed = plant.inverse_dynamics(*map(torch.as_tensor, (motion.q, motion.qd, motion.qdd)))
-    return motion.qd, (0.0 if recording.tau is None else recording.tau) - needed.numpy()
+    qd, taken = np.concatenate([m.qd for _, m in pairs]), []
+    for r, m in pairs:
+        needed = plant.inverse_dynamics(*map(torch.as_tensor, (m.q, m.qd, m.qdd)))
+        taken.append((0.0 if r.tau is None else r.tau) - needed.numpy())
+    columns = zip(qd.T, np.concatenate(taken).T, strict=True)
+    found = [np.linalg.lstsq(np.stack([np.sign(v), v], 1), torque)[0][0] for v, torque in columns]
+    return np.clip(found, 0.0, None)
 
 
 def as_recording_list(
@@ -253,6 +243,7 @@ def weighs(plant: Plant) -> bool:
 
 def adjustable_terms(
     plant: Plant,
+    law: Law,
     joint: Sequence[Recording],
     options: FitOptions = DEFAULTS,
     *,
@@ -261,8 +252,8 @@ def adjustable_terms(
 ) -> list[PlantParameter]:
     """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    If encoders have an offset `per_recording`, the plant has none, since it would only be their
-    mean. The torque's delay comes last.
+    None repeats another parameter: no encoder offset if each recording has its own, no gear loss
+    beside a law of the transmitted torque, no torque offset beside f_o. The torque's delay is last.
     """
     delay = [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
@@ -280,7 +271,9 @@ def adjustable_terms(
         drag=is_undriven_pendulum(plant, joint) if options.drag is None else options.drag,
         eccentricity=eccentric, options=options,
     )  # fmt: skip
-    return [t for t in terms if not (per_recording and "angle_offset" in t.change)] + delay
+    repeated = {"angle_offset": per_recording, "gear_loss": law.reads_drive,
+                "torque_offset": "f_o" in law.names}  # fmt: skip
+    return [t for t in terms if not any(repeated.get(name) for name in t.change)] + delay
 
 
 def advanced_torques(recordings: Sequence[Recording], delay: float) -> list[Recording]:

@@ -83,9 +83,11 @@ def fit_constant(task: FitTask) -> FitResult:
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
+        nested = _fitter(task, contained, by_torque, eccentric)
+        begin = known_terms(start, nested.jacobian.terms, task.delay)
         search = warm_start_from_nested(
-            search, fitter, _fitter(task, contained, by_torque, eccentric),
-            (by_torque.coefficients.reshape(-1), plant), task.motions, equation_error,
+            search, fitter, nested, (by_torque.coefficients.reshape(-1), begin), task.motions,
+            equation_error,
         )  # fmt: skip
     found = search.end
     # Terms that few rigs need come last, since they could absorb friction that is not yet fitted.
@@ -123,10 +125,9 @@ def _fitter(
 ) -> ShootingFitter:
     options, plant = task.options, task.plant
     terms = adjustable_terms(
-        plant, task.recordings, options, eccentric=eccentric, per_recording=task.per_recording
-    )
-    # A law of the transmitted torque has the losses of the gear itself.
-    terms = [t for t in terms if not (model.law.reads_drive and "gear_loss" in t.change)]
+        plant, model.law, task.recordings, options, eccentric=eccentric,
+        per_recording=task.per_recording,
+    )  # fmt: skip
     sd = options.encoder_offset_sd
     shape = (len(task.recordings), plant.joints)
     return ShootingFitter(
@@ -211,11 +212,18 @@ def best_of_starts(
     # With the larger of the two noises, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
+    names = [t.name for t in nested.problem.variables.terms]
+    shared = [names.index(t.name) for t in own.problem.variables.terms]
+    terms = nested.parts.plant[shared]
+    plant = own.problem.plant_at(terms)
+    implied = next(iter(equation_error(plant)))
     # Coefficients at which the law equals its nested law.
     embedded = torch.where(torch.tensor([c.linear for c in law.coefficients]), 0.0, implied)
     places = [law.names.index(name) for name in law.nested_coefficients]
     embedded[:, places] = nested.parts.friction.reshape(len(implied), -1)
+    if "f_o" in law.names:
+        offset = nested.problem.plant_at(nested.parts.plant).torque_offset
+        embedded[:, law.names.index("f_o")] = plant.torque_offset - offset
     loss = own.problem.loss
     best, lowest = own, _misfit(own, noise, loss) if same else math.inf
     limit = _misfit(nested, noise, loss)
@@ -224,7 +232,7 @@ def best_of_starts(
         if coefficients is embedded and lowest <= limit:
             break
         problem = fitter.problem(windows, noise, coefficients.reshape(-1))
-        start = problem.variables.start(nested.parts.plant, nested.parts.offsets)
+        start = problem.variables.start(terms, nested.parts.offsets)
         name = f"from the {nested.problem.friction.law.name} law"
         found = fitter.search(problem, start, tolerance, name)
         misfit = _misfit(found, noise, loss)

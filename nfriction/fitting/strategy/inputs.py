@@ -119,8 +119,8 @@ def widened_fitter(
             schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
     model = FrictionModel(law, schedule, start.model.v_smooth)
     terms = adjustable_terms(
-        plant, task.recordings, task.options, eccentric=fits_eccentricity(task.options, start),
-        per_recording=bool(start.encoder_offsets),
+        plant, law, task.recordings, task.options,
+        eccentric=fits_eccentricity(task.options, start), per_recording=bool(start.encoder_offsets),
     )  # fmt: skip
     torque = regression(task, model, seeing_plant(at.plant, inputs))
     return ShootingFitter(

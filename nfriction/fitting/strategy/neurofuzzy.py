@@ -138,8 +138,8 @@ class _Contest:
             task.model, start, task.recordings, task.motions, options
         )
         terms = adjustable_terms(
-            task.plant, task.recordings, options, eccentric=fits_eccentricity(options, start),
-            per_recording=bool(start.encoder_offsets),
+            task.plant, start.model.law, task.recordings, options,
+            eccentric=fits_eccentricity(options, start), per_recording=bool(start.encoder_offsets),
         )  # fmt: skip
         plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
         schedule = cast("NeuroFuzzy", self.network.schedule)
