@@ -19,6 +19,8 @@ from nfriction.friction import model_by_name
 from nfriction.signals import quantise
 
 COUNTS, RATE, SECONDS = 4096, 500, 10.0
+# Integration steps in a sample, of a scheme of first order.
+STEPS = 100
 TORQUE_NOISE = 0.01  # [N m]
 FLYWHEEL = (0.35, 0.15, 0.12, 0.3, 2.0)
 # An error up to here counts as found.
@@ -43,6 +45,7 @@ class Rig(NamedTuple):
     rate: int = RATE
     torque_noise: float = TORQUE_NOISE
     substeps: int = 8
+    sticks: bool = False
 
     @property
     def driven(self) -> bool:
@@ -57,7 +60,7 @@ def own_rigs(seeds: int, rigs: int) -> None:
     for of in cases(seeds, rigs):
         number = int(of.name.split()[-1])
         begun = time.perf_counter()
-        recordings = recorded(of, number)
+        recordings = recorded(of._replace(sticks=True, substeps=STEPS), number)
         found = fit(of.law, of.given, recordings)
         for line, verdict in judged(of, found):
             counts[verdict] += 1
@@ -206,7 +209,9 @@ def known(plant: Plant, seed: int, driven: bool) -> Plant:
 def recorded(rig: Rig, seed: int) -> list[Recording]:
     """Two recordings of ten seconds, rounded as an encoder reads them."""
     unit = rig.plant.unit
-    friction = model_by_name(rig.law)(rig.plant.joints, rig.truth)
+    # A real joint sticks: the sign turns at once.
+    known = {"v_smooth": 1e-5} if rig.sticks else {}
+    friction = model_by_name(rig.law)(rig.plant.joints, rig.truth, **known)
     return [
         recording(rig, friction, np.random.default_rng([seed, place]), f"{rig.name}.{place}", unit)
         for place in (0, 1)
@@ -228,6 +233,7 @@ def recording(
     run = rollout(
         rig.plant, friction, begin, rest, tau, sample_time=1 / rig.rate, steps=steps,
         substeps=rig.substeps, gradients=False,
+        scheme="time_stepping" if rig.sticks else "rk4",
     )  # fmt: skip
     q = run.q.numpy() - [
         math.pi if isinstance(rig.plant, PendulumChain) else 0.0,

@@ -88,24 +88,24 @@ def turning_velocity(
     """Width of the smoothed sign of the velocity [rad/s; m/s].
 
     A joint that friction holds creeps at about this velocity. It is a small share of the slowest
-    joint's largest velocity, and in the longest rest it does not move a joint by more than noise
-    of its readings; but never so small that dry friction is too steep for the steps of a fit.
-    Recordings are in joint coordinates.
+    joint's largest velocity, and in the longest rest of a driven rig it does not move a joint by
+    more than the noise of a reading; but never so small that dry friction is too steep for the
+    steps of a fit. Recordings are in joint coordinates.
     """
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
     pairs = list(zip(recordings, motions, strict=True))
-    creep = min(_creep(r, m, j) for r, m in pairs for j in range(plant.joints))
+    held = [_creep(*p, j) for p in pairs for j in range(plant.joints) if p[0].tau is not None]
     dry = plant.decay_rate(torch.as_tensor(_dry_friction(plant, pairs)))
     # Half the substeps, because coefficients may grow during the search.
     most = RK4_STABILITY * DEFAULTS.max_substeps / 2
     least = float(dry.max()) * max(r.longest_step for r in recordings) / most
-    return max(min(V_SMOOTH, TURN_SHARE * slowest, creep), least)
+    return max(min(V_SMOOTH, TURN_SHARE * slowest, *held), least)
 
 
 def _creep(recording: Recording, motion: Motion, joint: int) -> float:
     """Velocity [rad/s; m/s] that moves a joint by the noise of a reading in its longest rest."""
-    noise = 3 * float(np.std(recording.q[:, joint] - motion.q[:, joint]))
+    noise = float(np.std(recording.q[:, joint] - motion.q[:, joint]))
     if not noise:
         return math.inf
     longest = 0.0
@@ -113,7 +113,7 @@ def _creep(recording: Recording, motion: Motion, joint: int) -> float:
         span, q = recording.time[first : last + 1], motion.q[first : last + 1, joint]
         # Halves of a cell, because a rest may lie on a border.
         for shift in (0.0, 0.5):
-            moved = np.flatnonzero(np.diff(np.floor(q / (2 * noise) + shift)))
+            moved = np.flatnonzero(np.diff(np.floor(q / (6 * noise) + shift)))
             longest = max(longest, float(np.diff(span[[0, *moved, -1]]).max()))
     return noise / longest
 
