@@ -425,7 +425,7 @@ def coefficient_scale(
 
 
 def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Tensor:
-    """Width of the law's zero-mean priors in SI, (joint, coefficient); infinite for no prior."""
+    """Standard deviations of zero-mean priors [SI], (joint, coefficient); infinite without one."""
     shares = torch.tensor([c.prior_scale for c in law.coefficients], dtype=torque.torque.dtype)
     # On a light mechanism most of the torque consists of errors of inertia terms and smoothing.
     explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()
