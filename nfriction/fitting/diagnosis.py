@@ -381,9 +381,7 @@ def _scaled_terms(
     driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
     for term in plant_parameters(plant, driven=driven, options=options):
         if term.ratio and term.name.startswith(("inertia", "gravity", "mass")):
-            x = _amount(
-                plant, {name: own[name] * part for name, part in term.change.items()}, given
-            )
+            x = _amount(plant, {k: own[k] * part for k, part in term.change.items()}, given)
             if x > -1:
                 yield term, x, adjusted_plant(plant, [term], given.q.new_tensor([x]))
 

@@ -125,7 +125,7 @@ def test_the_sign_of_a_named_model_suits_speeds_and_steps(mass, viscous, v_smoot
         fit(model, axis, recording, windows=(0.5,), fit_plant=False) for model in ("CVFM", CVFM(1))
     )
     assert (found.model.v_smooth < usual.model.v_smooth) == (mass > 1)
-    assert found.residual < 0.3 * usual.residual
+    assert found.residual < 0.5 * usual.residual
     assert found.model.schedule.values[0].tolist() == pytest.approx([4.0, viscous], rel=0.01)
 
 

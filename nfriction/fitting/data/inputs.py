@@ -88,14 +88,15 @@ def turning_velocity(
     """Width of the smoothed sign of the velocity [rad/s; m/s].
 
     A joint that friction holds creeps at about this velocity. It is a small share of the slowest
-    joint's largest velocity, and in the longest rest of a driven rig it does not move a joint by
-    more than the noise of a reading; but never so small that dry friction is too steep for the
-    steps of a fit. Recordings are in joint coordinates.
+    joint's largest velocity; where a rig is driven or comes to rest, it moves no joint by more than
+    the noise of a reading in its longest rest; but it is never so small that dry friction is too
+    steep for the steps of a fit. Recordings are in joint coordinates.
     """
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
     pairs = list(zip(recordings, motions, strict=True))
-    held = [_creep(*p, j) for p in pairs for j in range(plant.joints) if p[0].tau is not None]
+    resting = [p for p in pairs if p[0].tau is not None or [*moving_segments(*p)] != p[0].segments]
+    held = [_creep(*p, j) for p in resting for j in range(plant.joints)]
     dry = plant.decay_rate(torch.as_tensor(_dry_friction(plant, pairs)))
     # Half the substeps, because coefficients may grow during the search.
     most = RK4_STABILITY * DEFAULTS.max_substeps / 2
@@ -109,7 +110,7 @@ def _creep(recording: Recording, motion: Motion, joint: int) -> float:
     if not noise:
         return math.inf
     longest = 0.0
-    for first, last in moving_segments(recording, motion):
+    for first, last in recording.segments:
         span, q = recording.time[first : last + 1], motion.q[first : last + 1, joint]
         # Halves of a cell, because a rest may lie on a border.
         for shift in (0.0, 0.5):
@@ -119,13 +120,14 @@ def _creep(recording: Recording, motion: Motion, joint: int) -> float:
 
 
 def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Array:
-    """Dry friction of each joint that the torques imply [N m; N], (joint,)."""
+    """Dry friction of each joint that the dissipated power implies [N m; N], (joint,)."""
     qd, taken = np.concatenate([m.qd for _, m in pairs]), []
     for r, m in pairs:
         needed = plant.inverse_dynamics(*map(torch.as_tensor, (m.q, m.qd, m.qdd)))
         taken.append((0.0 if r.tau is None else r.tau) - needed.numpy())
     columns = zip(qd.T, np.concatenate(taken).T, strict=True)
-    found = [np.linalg.lstsq(np.stack([np.sign(v), v], 1), torque)[0][0] for v, torque in columns]
+    # At rest the direction is that of the noise, and the power is none.
+    found = [np.linalg.lstsq(np.stack([v, v * abs(v)], 1), f * abs(v))[0][0] for v, f in columns]
     return np.clip(found, 0.0, None)
 
 
