@@ -145,7 +145,7 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
 def test_a_delay_makes_a_fit_doubtful_where_coefficients_leave_their_intervals(motion, verdict):
     recording, truth = driven_pendulum(*motion), np.ravel(DRY)
     found, right = (
-        fit("coulomb-viscous", pendulum(), recording, windows=(0.5,), fit_delay=fitted)
+        fit(CVFM(2), pendulum(), recording, windows=(0.5,), fit_delay=fitted)
         for fitted in (False, True)
     )
     (said,) = (text for text in found.warnings if "Perhaps torques" in text)
