@@ -371,7 +371,7 @@ def compare(
         raise ValueError("at least one model and one training recording are needed.")
     check_recordings(train, test)
     for name in models:
-        require_drive(as_model(name, plant).law, [*train, *test])
+        require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
     progress.expect(1 + len(set(map(model_name, models))), brief=True)  # scores, besides fits

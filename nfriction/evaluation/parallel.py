@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 
-from nfriction.fitting.data.inputs import as_model, in_joint_coordinates
+from nfriction.fitting.data.inputs import in_joint_coordinates, turning_velocity
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
@@ -100,13 +100,16 @@ def fit_models(
     errors: list[Exception] = []
     origin = warm_starts(names)
     progress.expect(len(parts) * len(names))
-    joint = {k: in_joint_coordinates(plant, x.recordings, plant.joints) for k, x in parts.items()}
+    turning = {}
+    for part, (given, moved) in parts.items():
+        joint = in_joint_coordinates(plant, given, plant.joints)
+        turning[part] = turning_velocity(plant, joint, moved)
     for level in dependency_levels(origin):
         labels = {f"{part} {name}": (part, name) for part in parts for name in level}
         tasks = {
             # An instance, because another process may not know a user's law.
             label: (
-                as_model(name, plant, joint[part], parts[part].motions), plant, parts[part],
+                model_by_name(name)(plant.joints, v_smooth=turning[part]), plant, parts[part],
                 results[part].found.get(origin[name] or ""), fit_settings,
             )
             for label, (part, name) in labels.items()

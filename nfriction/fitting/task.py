@@ -73,12 +73,13 @@ def prepare_task(
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
     # Checked before much time is spent on recordings.
-    checked = inputs.as_model(model, plant)
-    inputs.require_doubles(checked, plant)
+    by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
+    inputs.require_doubles(model, plant)
     given = inputs.as_recording_list(recordings, plant)
-    joint = inputs.in_joint_coordinates(plant, given, checked.joints)
+    joint = inputs.in_joint_coordinates(plant, given, model.joints)
     moved = inputs.smoothed_motions(joint, motions)
-    model = inputs.as_model(model, plant, joint, moved)
+    if by_name:
+        model.v_smooth = inputs.turning_velocity(plant, joint, moved)
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "

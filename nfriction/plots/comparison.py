@@ -404,10 +404,8 @@ def _figures(
     # Constants along the motion are worth drawing only with coefficients that follow it.
     moving = [m for m in models.values() if "always" not in m.schedule.coefficient_sets()]
     for law in dict.fromkeys(model.law.name for model in moving):
-        yield (
-            f"over_time_{law}",
-            neurofuzzy.coefficients_over_time(models, moved[0], law=law, **labels),
-        )
+        drawn = neurofuzzy.coefficients_over_time(models, moved[0], law=law, **labels)
+        yield f"over_time_{law}", drawn
     for name, found in comparison.fits.items():
         if (rules := found.model.schedule.fuzzy_rules()) is not None and not rules.constant:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}

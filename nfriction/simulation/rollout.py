@@ -12,10 +12,19 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from nfriction.simulation import protocols, validate
+from nfriction.simulation import validate
 from nfriction.simulation.adjoint import adjoint_rollout, wants_gradients
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.memory_step import memory_of, memory_step
+from nfriction.simulation.protocols import (
+    Friction,
+    NoFriction,
+    Plant,
+    Rollout,
+    RolloutInputs,
+    StepFunction,
+    with_sample_time,
+)
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 
@@ -24,8 +33,8 @@ Scheme = Literal["rk4", "time_stepping"]
 
 @validate.outside_inference_mode
 def rollout(
-    plant: protocols.Plant,
-    friction: protocols.Friction | None,
+    plant: Plant,
+    friction: Friction | None,
     q0: Tensor,
     qd0: Tensor,
     tau: Tensor | None = None,
@@ -41,7 +50,7 @@ def rollout(
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
-) -> protocols.Rollout:
+) -> Rollout:
     """Simulate a plant with friction from an initial state.
 
     Models from `fit` and `load` require no gradients and are compiled, thousands of times faster
@@ -84,44 +93,40 @@ def rollout(
             a stable integration, or the scheme does not support an option.
         CodegenError: if `backend="compiled"` and the model cannot be compiled.
     """
-    model = protocols.NoFriction(plant.joints) if friction is None else friction
+    model = NoFriction(plant.joints) if friction is None else friction
     inputs = validate.validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate.validate_measured(drive, measured, inputs))
-    model = protocols.with_sample_time(model, inputs.step)
+    model = with_sample_time(model, inputs.step)
     inputs = validate.with_states(inputs, model, hidden_state, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
-        return protocols.Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
+        return Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
     system = System.of(plant, model)
     validate.require_stability(system, inputs)
     if gradients is None:
         gradients = backend != "compiled" and wants_gradients(inputs, system.tensors.values())
     states = simulate(system, inputs, gradients, backend, threads)
-    return protocols.Rollout.of(inputs, states)
+    return Rollout.of(inputs, states)
 
 
-def integrate(
-    plant: protocols.Plant, friction: protocols.Friction | None, inputs: protocols.RolloutInputs
-) -> protocols.Rollout:
+def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may be unstable."""
-    model = protocols.NoFriction(plant.joints) if friction is None else friction
+    model = NoFriction(plant.joints) if friction is None else friction
     inputs = validate.with_states(inputs, model, inputs.hidden_state, inputs.law_state)
-    return protocols.Rollout.of(inputs, simulate(System.of(plant, model), inputs))
+    return Rollout.of(inputs, simulate(System.of(plant, model), inputs))
 
 
 def simulate(
     system: System,
-    inputs: protocols.RolloutInputs,
+    inputs: RolloutInputs,
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
 ) -> tuple[Tensor, ...]:
     """States q, qd, qdd, each (*batch, steps + 1, joint), from the backend that supports them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
-    step_function: protocols.StepFunction = (
-        rk4_step if memory_of(system.friction) is None else memory_step
-    )
+    step_function: StepFunction = rk4_step if memory_of(system.friction) is None else memory_step
     states = None
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":

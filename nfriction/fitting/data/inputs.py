@@ -9,7 +9,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, pairwise
+from itertools import chain, compress, pairwise
 
 import numpy as np
 import torch
@@ -44,21 +44,15 @@ TURN_SHARE = 1e-3
 ALIKE = 0.02
 
 
-def as_model(
-    model: FrictionModel | str,
-    plant: Plant,
-    recordings: Sequence[Recording] = (),
-    motions: Sequence[Motion] = (),
-) -> FrictionModel:
-    """The given model, or a new one by its name, with a smoothed sign that suits the recordings.
+def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
+    """The given model, or a new one by its name.
 
     Raises:
         TypeError: for anything else.
         ValueError: if no model has that name.
     """
     if isinstance(model, str):
-        v_smooth = turning_velocity(plant, recordings, motions) if recordings else V_SMOOTH
-        return model_by_name(model)(plant.joints, v_smooth=v_smooth)
+        return model_by_name(model)(joints)
     if not isinstance(model, FrictionModel):
         raise TypeError(
             "`model` must be a friction model such as LFM(joints=3), or the name of one, got "
@@ -95,8 +89,8 @@ def turning_velocity(
     speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
     pairs = list(zip(recordings, motions, strict=True))
-    resting = [p for p in pairs if p[0].tau is not None or [*moving_segments(*p)] != p[0].segments]
-    held = [_creep(*p, j) for p in resting for j in range(plant.joints)]
+    rests = [r.tau is not None or [*moving_segments(r, m)] != r.segments for r, m in pairs]
+    held = [_creep(*p, j) for p in compress(pairs, rests) for j in range(plant.joints)]
     dry = plant.decay_rate(torch.as_tensor(_dry_friction(plant, pairs)))
     # Half the substeps, because coefficients may grow during the search.
     most = RK4_STABILITY * DEFAULTS.max_substeps / 2
@@ -112,7 +106,7 @@ def _creep(recording: Recording, motion: Motion, joint: int) -> float:
     longest = 0.0
     for first, last in recording.segments:
         span, q = recording.time[first : last + 1], motion.q[first : last + 1, joint]
-        # Halves of a cell, because a rest may lie on a border.
+        # Cells of three standard deviations to either side; a rest may lie on a border of one.
         for shift in (0.0, 0.5):
             moved = np.flatnonzero(np.diff(np.floor(q / (6 * noise) + shift)))
             longest = max(longest, float(np.diff(span[[0, *moved, -1]]).max()))

@@ -119,12 +119,9 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     by_class = ClassFit.of(task, schedule, constant, length, classes)
     task, given, windows = by_class.task, by_class.given, by_class.windows
     terms = adjustable_terms(
-        task.plant,
-        given.law,
-        task.recordings,
-        options,
+        task.plant, given.law, task.recordings, options,
         per_recording=bool(constant.encoder_offsets),
-    )
+    )  # fmt: skip
     vector = known_terms(constant, terms)
     sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
     fitter = ClassFitter(
