@@ -1,5 +1,6 @@
 """Terms of a plant that a fit may adjust, with their bounds and priors."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import torch
@@ -76,6 +77,16 @@ def plant_parameters(
                 name = f"encoder {part} {j + 1} [rad]"
                 found.append(PlantParameter(name, unit, -bound, bound, sd))
     return found
+
+
+def position_terms(plant: nn.Module) -> list[PlantParameter]:
+    """Phases of loads that follow the position, which may have any value."""
+    buffers, most = dict(plant.named_buffers()), math.pi
+    units = [_at(buffers, "load_phase", j) for j in range(len(buffers["load_phase"]))]
+    return [
+        PlantParameter(f"load phase {j + 1} [rad]", unit, -most, most, most)
+        for j, unit in enumerate(units)
+    ]
 
 
 def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:

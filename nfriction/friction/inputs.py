@@ -1,4 +1,4 @@
-"""Laws whose friction depends on more than the speed: on direction, load and heat."""
+"""Laws whose friction depends on more than the speed: on direction, load or position, and heat."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,6 +15,8 @@ INPUTS = {
     # Friction that is larger in one direction than in the other; it vanishes at rest.
     "direction": Coefficient("F_t", "N m", positive=False, prior_scale=1.0),
     "load": Coefficient("F_n", "N m", prior_scale=1.0),
+    # In place of the load, and periodic: 1 at most.
+    "position": Coefficient("F_p", "N m", prior_scale=1.0),
     # Friction that falls with the heat of the joint, whose last coefficient is that heat.
     "heat": FALL,
 }
@@ -23,16 +25,23 @@ INPUTS = {
 def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
     """A law with further inputs.
 
-    Direction gives `f + F_t sgn(qd)^2`, load `f + F_n load sgn(qd)`; heat multiplies the result by
+    Direction gives `f + F_t sgn(qd)^2`, load `f + F_n load sgn(qd)`; so does position, with a plant
+    whose load is `(1 + cos(k q + p)) / 2` (`Plant.load`); heat multiplies the result by
     `exp(-k_h h)`, with h a hidden state of the coefficients (`nfriction.friction.heat`).
 
     Raises:
-        ValueError: for an input that does not exist or is repeated.
+        ValueError: for an input that does not exist or is repeated; for load with position, or one
+            of them for a law of the load.
     """
     listed = isinstance(inputs, list | tuple)
     chosen = tuple(name for name in INPUTS if listed and name in inputs)
     if not listed or len(chosen) != len(inputs):
         raise ValueError(f"`inputs` must be different ones of {', '.join(INPUTS)}, got {inputs!r}.")
+    if "position" in chosen and ("load" in chosen or reads_load(law)):
+        raise ValueError(
+            'the input "position" replaces the load, on which this friction depends already: leave '
+            'out one of them, or take a law without the load, such as "arctan".'
+        )
     if not chosen:
         return law
     own = (*law.coefficients, *(INPUTS[name] for name in chosen), *(HEAT,) * ("heat" in chosen))
@@ -56,7 +65,8 @@ class _WithInputs(nn.Module):
     def __init__(self, torque: TorqueFunction, own: int, inputs: tuple[str, ...]) -> None:
         super().__init__()
         self.torque, self.own, self.given = torque, own, inputs
-        self.turns, self.loaded, self.heated = (name in inputs for name in INPUTS)
+        self.turns, load, position, self.heated = (name in inputs for name in INPUTS)
+        self.loaded = load or position
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _torque_with_inputs, (self.torque, self.own, self.given)
@@ -78,16 +88,32 @@ def is_heated(law: Law) -> bool:
     return isinstance(law.torque, _WithInputs) and law.torque.heated
 
 
-def require_bearing_loads(law: Law, plant: object) -> None:
+def reads_load(law: Law) -> bool:
+    """True of a law whose torque depends on the load."""
+    one = torch.ones(1, 1, dtype=torch.float64)
+    coefficients = one.expand(1, 1, len(law.names))
+    return not torch.equal(*(law.torque(one, k * one, coefficients, 1.0) for k in (1.0, 2.0)))
+
+
+def require_loads(law: Law, plant: object) -> None:
     """Refuse a plant whose loads are not those that a law depends on.
 
     Raises:
-        ValueError: if the law has the input `"load"` and the plant gives the loads of links.
+        ValueError: if the law has the input `"load"` and the plant gives the loads of links, or if
+            only one of them depends on the position.
     """
-    loaded = isinstance(law.torque, _WithInputs) and law.torque.loaded
-    if loaded and getattr(plant, "has_link_load", False):
+    given = law.torque.given if isinstance(law.torque, _WithInputs) else ()
+    if "load" in given and getattr(plant, "has_link_load", False):
         raise ValueError(
             "the friction depends on the loads of the bearings, and this plant gives those of "
             "single links: take the plant of the fit (`FitResult.plant`, `nfriction.load_plant`), "
             'or one with `normal_load` "bearing".'
+        )
+    placed = getattr(plant, "has_position_load", "position" in given)
+    if placed != ("position" in given) and (not placed or reads_load(law)):
+        is_not = ("", " does not") if placed else (" does not", "")
+        raise ValueError(
+            f"the load of this plant{is_not[0]} follow the position, and that of the friction"
+            f"{is_not[1]}: take the plant of the same fit (`FitResult.plant`, "
+            "`nfriction.load_plant`)."
         )

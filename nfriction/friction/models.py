@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
-from nfriction.friction.inputs import require_bearing_loads
+from nfriction.friction.inputs import require_loads
 from nfriction.friction.laws import Law
 from nfriction.friction.parameters import as_tensor, positive_number, require_options
 
@@ -117,8 +117,8 @@ class FrictionModel(nn.Module):
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def check_loads(self, plant: object) -> None:
-        """Refuse a plant with other loads than the friction's, see `require_bearing_loads`."""
-        require_bearing_loads(self.law, plant)
+        """Refuse a plant with other loads than the friction's, see `require_loads`."""
+        require_loads(self.law, plant)
 
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).

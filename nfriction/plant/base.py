@@ -88,6 +88,9 @@ class Plant(nn.Module, ABC):
     optional: ClassVar[tuple[str, ...]]
 
     torque_offset: Tensor
+    load_waves: Tensor  # k, per radian or metre of position; loads follow the position if replaced
+    load_phase: Tensor  # p [rad], (joints,)
+    has_position_load: bool = False
     has_drag: bool = False
     first_link: int = 0
     # True if `load` is that of each joint's own link, and could be that of its bearing.
@@ -123,6 +126,8 @@ class Plant(nn.Module, ABC):
         if not isinstance(motor, Motor | None):
             raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
         self.motor = motor
+        for buffer in ("load_waves", "load_phase"):
+            self.register_buffer(buffer, torch.zeros(joints, dtype=torch.float64))
         _ = self.motor_factors  # raises unless there is one number for each joint
 
     @property
@@ -155,8 +160,18 @@ class Plant(nn.Module, ABC):
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Joint torques that give the accelerations."""
 
-    @abstractmethod
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Quantity other than speed on which the friction of each joint depends [-].
+
+        The normal load over that at rest; if `load_waves` was replaced, (1 + cos(k q + p)) / 2.
+        """
+        self._check(q=q, qd=qd)
+        if self.has_position_load:
+            return 0.5 + 0.5 * (self.load_waves * q + self.load_phase).cos()
+        return self.normal_load(q, qd)
+
+    @abstractmethod
+    def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its load at rest [-]."""
 
     @abstractmethod
@@ -203,6 +218,7 @@ class Plant(nn.Module, ABC):
 
     def _note_replaced(self, names: Collection[str]) -> None:
         """Hook of `replace` for terms that are omitted while their buffers are zero."""
+        self.has_position_load = self.has_position_load or "load_waves" in names
 
     def _check(self, **states: Tensor) -> None:
         for name, value in states.items():
@@ -330,9 +346,8 @@ class LinearAxis(Plant):
         kinetic = (self.mass * qd * qd / 2).squeeze(-1)
         return kinetic, torch.zeros_like(kinetic)
 
-    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+    def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load over the load at rest [-]: 1, since the guide always carries the weight."""
-        self._check(q=q, qd=qd)
         return torch.ones_like(q)
 
     @torch.no_grad()

@@ -302,7 +302,7 @@ class PendulumChain(Plant):
         height = [angle.cos() for angle in geometry.pose.angle]
         return kinetic, dynamics.dot(self.gravity_moment.unbind(-1), height)
 
-    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+    def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its load at rest [-].
 
         For links |N_i| / (m_i g), N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate
@@ -314,7 +314,6 @@ class PendulumChain(Plant):
             TLRIP paper, eqs. (26)-(29), with - m g cos phi for + m g cos theta: the printed sign
             belongs to angles from hanging; taken literally, it feeds in energy.
         """
-        self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
         if self.bearing_load:
             pose = self._geometry(q).pose
@@ -360,6 +359,7 @@ class PendulumChain(Plant):
         )
 
     def _note_replaced(self, names: Collection[str]) -> None:
+        super()._note_replaced(names)
         if {"drag_linear", "drag_quadratic"} & set(names):
             if self.first_link:
                 raise ValueError(

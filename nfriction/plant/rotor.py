@@ -79,9 +79,8 @@ class Rotor(PendulumChain):
         self.motor = motor
         self._given = {**given, "convention": list(self.convention)}
 
-    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+    def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
         """1 [-], because the load of a motor's gear and bearings hardly depends on the pose."""
-        self._check(q=q, qd=qd)
         return torch.ones_like(q)
 
     def extra_repr(self) -> str:

@@ -22,6 +22,7 @@ from nfriction.fitting.plant_parameters import (
     PlantParameter,
     has_weight,
     plant_parameters,
+    position_terms,
     torque_delay_term,
 )
 from nfriction.friction import model_by_name
@@ -252,6 +253,8 @@ def adjustable_terms(
     beside a law of the transmitted torque, no torque offset beside f_o. The torque's delay is last.
     """
     delay = [torque_delay_term(options)] if options.fit_delay else []
+    # Of the friction, whether the plant is fitted or not.
+    delay = [*position_terms(plant), *delay] if plant.has_position_load else delay
     if not options.fit_plant:
         return delay
     largest = largest_torques(joint)

@@ -7,7 +7,7 @@ The choice among the candidates is then made on hold-out windows.
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -37,14 +37,17 @@ from nfriction.fitting.task import (
 )
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated, HeatedConstant
-from nfriction.friction.inputs import INPUTS, is_heated, with_inputs
-from nfriction.friction.laws import Law
+from nfriction.friction.inputs import INPUTS, is_heated, reads_load, with_inputs
+from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import PendulumChain, Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.signals import Motion
+
+# Waves of friction per turn, or per stroke of an axis, in dependence on the position.
+WAVES = (1, 2, 3, 4)
 
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
@@ -56,17 +59,67 @@ def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
 
 def candidates(task: FitTask) -> tuple[str, ...]:
     """Inputs that are possible with a law and a plant."""
-    plant, law = task.plant, task.model.law
-    one = torch.ones(1, 1, dtype=torch.float64)
-    coefficients = one.expand(1, 1, len(law.names))
-    torques = [law.torque(one, load * one, coefficients, 1.0) for load in (1.0, 2.0)]
+    plant, free = task.plant, not reads_load(task.model.law)
     # Bearing loads are known for chains on a fixed pivot; a load-dependent law uses one already.
     known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
-    loaded = known and torch.equal(*torques)
     # The papers' network may have a hidden state of its own.
     heated = "network" not in task.model.options()
-    possible = {"direction": True, "load": loaded, "heat": heated}
+    possible = {"direction": True, "load": free and known, "position": free, "heat": heated}
     return tuple(name for name in INPUTS if possible[name])
+
+
+class _WavesTorque:
+    """Torque of a law and of waves over the position, whose coefficients follow its own."""
+
+    def __init__(self, law: Law) -> None:
+        self.torque, self.own = law.torque, len(law.names)
+
+    def __call__(self, qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+        own, waves = coefficients.tensor_split([self.own], -1)
+        # Loads are the waves, (*batch, joint, wave), except where a caller gives those of a rest.
+        load = load if load.ndim == waves.ndim else load[..., None]
+        tau_f = self.torque(qd, torch.ones_like(qd), own, v_smooth)
+        return tau_f + (waves * load).sum(-1) * torch.tanh(qd / v_smooth)
+
+
+def placed(task: FitTask, start: FitResult) -> FitTask:
+    """The task with the plant's load (1 + cos(k q + p)) / 2, for k and p favoured by the evidence.
+
+    All waves and joints are fitted at once; then each joint keeps the wave that it needs most.
+    """
+    # Waves of an axis fit into its stroke.
+    turn = 2 * math.pi if task.plant.unit == "rad" else max(np.ptp(m.q) for m in task.motions)
+    rates = 2 * math.pi / turn * torch.tensor(WAVES, dtype=torch.float64)
+
+    def load(q: Tensor, qd: Tensor) -> Tensor:
+        angle = rates * q[..., None]
+        return torch.cat([angle.cos(), angle.sin()], -1)
+
+    def at(waves: Tensor, phases: Tensor) -> FitTask:
+        return replace(task, plant=task.plant.replace(load_waves=waves, load_phase=phases))
+
+    own, plants = start.model.law, [plant.replace() for plant in (task.plant, start.plant)]
+    for plant in plants:
+        plant.load = load  # type: ignore[method-assign]
+    names = [f"{part} {k}" for part in ("cosine", "sine") for k in WAVES]
+    waves = [Coefficient(name, "N m", positive=False, prior_scale=1.0) for name in names]
+    law = Law(f"{own.name}_by_waves", (*own.coefficients, *waves), _WavesTorque(own))
+    fitter = _fitter(task, start, start, law, plants)
+    choice = _Choice.of(fitter, task, start, {name: name for name in names})
+    if choice is None:
+        one = torch.ones(task.plant.joints, dtype=torch.float64)
+        return at(rates[0] * one, 0.0 * one)
+    pairs = torch.tensor([choice.columns[name] for name in names]).reshape(2, len(WAVES), -1)
+    choice = choice.with_noise_beside(pairs.flatten().tolist())
+    best: list[int] = []
+    for j in range(task.plant.joints):
+        others = [p[:, best[i]] if i < j else p.flatten() for i, p in enumerate(pairs.unbind(-1))]
+        del others[j]
+        tried = [torch.cat([*others, pair]).tolist() for pair in pairs[..., j].unbind(-1)]
+        best.append(int(np.argmax([choice.evidence(columns)[0] for columns in tried])))
+    chosen = pairs[:, best, range(len(best))]
+    cosine, sine = choice.evidence(chosen.flatten().tolist())[2][chosen]
+    return at(rates[best], torch.atan2(-sine, cosine))
 
 
 def longest_duration(motions: Sequence[Motion]) -> float:
@@ -106,8 +159,19 @@ def widened_fitter(
     `cooling_time` [s] is the time constant of the input heat; `at` is a fit with some of the inputs
     to start from instead.
     """
-    law, plant = with_inputs(start.model.law, inputs), seeing_plant(task.plant, inputs)
-    at = at or start
+    law, at = with_inputs(start.model.law, inputs), at or start
+    plant, fitted = (seeing_plant(plant, inputs) for plant in (task.plant, at.plant))
+    if plant.has_position_load:
+        fitted = fitted.replace(load_waves=plant.load_waves, load_phase=plant.load_phase)
+    return _fitter(task, start, at, law, (plant, fitted), cooling_time)
+
+
+def _fitter(
+    task: FitTask, start: FitResult, at: FitResult, law: Law, plants: Sequence[Plant],
+    cooling_time: float = math.nan,
+) -> ShootingFitter:  # fmt: skip
+    """Fitter of constant coefficients of a law, on a plant as given and as fitted before."""
+    plant, fitted = plants
     values = at.model.schedule.coefficient_sets()["always"].T
     known = dict(zip(at.model.law.names, values, strict=True))
     initial = torch.stack([known.get(name, 0.0 * values[0]) for name in law.names], -1)
@@ -122,7 +186,7 @@ def widened_fitter(
         plant, law, task.recordings, task.options,
         eccentric=fits_eccentricity(task.options, start), per_recording=bool(start.encoder_offsets),
     )  # fmt: skip
-    torque = regression(task, model, seeing_plant(at.plant, inputs))
+    torque = regression(task, model, fitted)
     return ShootingFitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, task.options,
         task.callback, friction_prior=constant_prior(model, torque, task.options),
@@ -197,8 +261,10 @@ def drives(found: FitResult, own: int) -> bool:
     return False
 
 
-def chosen_inputs(task: FitTask, start: FitResult) -> tuple[tuple[InputGain, ...], FitResult]:
-    """Inputs favoured by the evidence, and the constant fit with them.
+def chosen_inputs(
+    task: FitTask, start: FitResult
+) -> tuple[tuple[InputGain, ...], FitResult, FitTask]:
+    """Inputs favoured by the evidence, the constant fit with them, and the task with their plant.
 
     Forward selection: each raises the evidence of the fit with the previous ones most.
 
@@ -209,19 +275,35 @@ def chosen_inputs(task: FitTask, start: FitResult) -> tuple[tuple[InputGain, ...
     Raises:
         StoppedError: if the caller stops a search.
     """
-    names, at = candidates(task), start
+    names, at, longest = candidates(task), start, longest_duration(task.motions)
+    # Load and position exclude each other: the plant gives only one of them.
+    rivals = {"position": task}
+    if "position" in names:
+        rivals["load"] = placed(task, start)
     chosen: list[InputGain] = []
-    while len(chosen) < len(names):
-        fitter = widened_fitter(task, start, names, longest_duration(task.motions), at)
-        choice, held = _Choice.of(fitter, task, at, names), [gain.name for gain in chosen]
-        best = choice.best(held, task.options.evidence_gain) if choice else None
-        if best is None:
+    while True:
+        found, held = [], [gain.name for gain in chosen]
+        for other, one in rivals.items():
+            open_ = [name for name in names if name != other]
+            fitter = widened_fitter(one, start, open_, longest, at)
+            choice = _Choice.of(fitter, one, at, {name: INPUTS[name].name for name in open_})
+            best = choice.best(held, task.options.evidence_gain) if choice else None
+            found += [(*best, other)] if best else []
+        if not found:
             break
-        found = widened_start(task, start, [*held, best.name])
-        if found is None:
+        _, gain, other = max(found, key=lambda one: one[0])
+        chosen.append(gain)
+        if gain.name in ("load", "position"):
+            rivals = {other: rivals[other]}
+        inputs = [gain.name for gain in chosen]
+        seeing = rivals["load"] if "position" in inputs else task
+        widened = widened_start(seeing, start, inputs)
+        if widened is None:
             raise StoppedError
-        chosen, at = [*chosen, best], found
-    return tuple(chosen), at
+        at = widened
+    held = [gain.name for gain in chosen]
+    seeing = rivals["load"] if "position" in held else task
+    return tuple(chosen), at, replace(seeing, plant=seeing_plant(seeing.plant, held))
 
 
 @dataclass(frozen=True)
@@ -235,7 +317,11 @@ class _Choice:
 
     @classmethod
     def of(
-        cls, fitter: ShootingFitter, task: FitTask, start: FitResult, names: Sequence[str]
+        cls,
+        fitter: ShootingFitter,
+        task: FitTask,
+        start: FitResult,
+        coefficients: Mapping[str, str],
     ) -> "_Choice | None":
         windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
         noise, model = effective_noise(start.residuals), fitter.friction
@@ -257,7 +343,7 @@ class _Choice:
         lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         place = model.law.names.index
-        columns = {name: rows[:, place(INPUTS[name].name)].tolist() for name in names}
+        columns = {name: rows[:, place(c)].tolist() for name, c in coefficients.items()}
         bounds = lower.clamp(max=0.0), upper.clamp(min=0.0)
         whole = _of_shared(local, shared)
         errors = Quadratic(
@@ -265,24 +351,34 @@ class _Choice:
         )  # fmt: skip
         return cls(errors, prior, bounds, columns)
 
-    def best(self, held: Sequence[str], least: float) -> InputGain | None:
-        """The input that raises the log evidence most beside those held; None if below `least`."""
+    def with_noise_beside(self, held: Sequence[int]) -> "_Choice":
+        """The same with the noise that is unexplained by the columns `held`."""
+        ratio = self.evidence([])[1] / self.evidence(held)[1]
+        e = self.errors
+        errors = Quadratic(ratio * e.cost, ratio * e.gradient, ratio * e.hessian)
+        return replace(self, errors=errors)
+
+    def best(self, held: Sequence[str], least: float) -> tuple[float, InputGain] | None:
+        """The input that raises the log evidence most beside those held, and by how much.
+
+        None if by less than `least`.
+        """
         columns = [column for name in held for column in self.columns[name]]
-        before, left = self.evidence(columns)
+        before, left, _ = self.evidence(columns)
         found = {
             name: self.evidence([*columns, *more])
             for name, more in self.columns.items()
             if name not in held
         }
-        best = max(found, key=lambda name: found[name][0])
-        if not found[best][0] - before > least:
+        best = max(found, key=lambda name: found[name][0], default="")
+        if not (best and found[best][0] - before > least):
             return None
         each = [self.evidence([*columns, column])[1] for column in self.columns[best]]
         by_joint = tuple(1.0 - alone / left for alone in each)
-        return InputGain(best, 1.0 - found[best][1] / left, by_joint)
+        return found[best][0] - before, InputGain(best, 1.0 - found[best][1] / left, by_joint)
 
-    def evidence(self, held: Sequence[int]) -> tuple[float, float]:
-        """Log evidence with the columns `held`, up to a constant, and the cost of the errors.
+    def evidence(self, held: Sequence[int]) -> tuple[float, float, Tensor]:
+        """Log evidence with the columns `held`, up to a constant, cost of the errors, and step.
 
         Laplace's approximation at the minimum within the bounds.
         """
@@ -308,7 +404,9 @@ class _Choice:
         spread = torch.linalg.slogdet(least.hessian[moved][:, moved]).logabsdet
         known = self.prior.hessian.diagonal()[list(held)].log().sum()
         evidence = float(0.5 * (known - spread) - least.cost)
-        return evidence, float(at(self.errors, end.x).cost)
+        step = torch.zeros_like(self.prior.gradient)
+        step[free] = end.x
+        return evidence, float(at(self.errors, end.x).cost), step
 
 
 def _of_shared(local: Quadratic, shared: int) -> Quadratic:

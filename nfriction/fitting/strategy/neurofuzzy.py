@@ -66,8 +66,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     require_motion(task.plant, task.recordings)
     given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
     task = replace(task, plant=inputs.seeing_plant(task.plant, given))
-    heated, own = is_heated(task.model.law), task
-    if heated:
+    widens, own = bool({"heat", "position"} & {*given}), task
+    if widens:
         law = cast("NeuroFuzzyModel", task.model).definition
         cold = FrictionModel(law, Constant(law, task.model.joints), task.model.v_smooth)
         own = replace(task, model=cold)
@@ -76,7 +76,9 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
     aligned = replace(task, recordings=recordings, motions=motions)
-    widened = inputs.widened_start(aligned, start, given) if heated else start
+    if "position" in given:
+        aligned = inputs.placed(aligned, start)
+    widened = inputs.widened_start(aligned, start, given) if widens else start
     if widened is None:
         fitter = inputs.widened_fitter(aligned, start, given, inputs.longest_duration(motions))
         start = replace(start, model=fitter.friction)
@@ -108,14 +110,13 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:
     """Inputs that improve law and network on hold-out windows (or none), and their contest."""
     task = plain.task
-    chosen, start = inputs.chosen_inputs(task, plain.start)
+    chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
     names = [gain.name for gain in chosen]
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
-    seeing = replace(task, model=model, plant=inputs.seeing_plant(task.plant, names))
-    rival = _Contest(seeing, start)
+    rival = _Contest(replace(seeing, model=model), start)
     if not gains(rival.validation.of_law, plain.validation.of_law):
         return (), plain
     rival.train()
