@@ -476,8 +476,8 @@ class NeuroFuzzyModel(NamedModel):
         joints, initial, v_smooth: see `NamedModel`; training starts from the constants `initial`.
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
         inputs: quantities other than speed and acceleration on which friction depends:
-            `"direction"` of rotation, `"load"` of the bearing, `"heat"` of the joint, each with its
-            own coefficient (`with_inputs`); with None, a fit selects the useful ones.
+            `"direction"` of rotation, `"load"` of the bearing or `"position"`, `"heat"` of joints,
+            each with its own coefficient (`with_inputs`); with None, a fit selects the useful ones.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 

@@ -1,29 +1,44 @@
 """Inputs of friction besides the speed are chosen by evidence, and have to win on hold-out."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, NFCVFM, Recording, Rotor, fit, rollout
+from nfriction import (
+    CVFM,
+    LFM,
+    NFCVFM,
+    LinearAxis,
+    PendulumChain,
+    Recording,
+    Rotor,
+    fit,
+    rollout,
+)
 from nfriction.export import c
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
+from nfriction.fitting.strategy.inputs import (
+    WAVES as TRIED,
+)
 from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
     candidates,
     chosen_inputs,
     drives,
+    placed,
     widened_start,
 )
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import HeatedConstant
 from nfriction.friction.inputs import with_inputs
-from nfriction.friction.laws import COULOMB_VISCOUS
+from nfriction.friction.laws import COULOMB_VISCOUS, LINEAR
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.optim.least_squares import Quadratic
@@ -36,8 +51,10 @@ TRUTHS = {
     "nothing": ([], [[5e-3, 1e-3], [2e-3, 5e-4]]),
     "direction": (["direction"], [[5e-3, 1e-3, 2e-3], [2e-3, 5e-4, -1e-3]]),
     "load": (["load"], [[1e-3, 1e-3, 4e-3], [5e-4, 5e-4, 2e-3]]),
+    "position": (["position"], [[4e-3, 1e-3, 3e-3], [1e-3, 5e-4, 2e-3]]),
     "heat": (["heat"], [[5e-3, 1e-3, 1.5, 0.0], [2e-3, 5e-4, 1.0, 0.0]]),
 }
+WAVES, PHASES = torch.tensor([1.0, 3.0]).double(), torch.tensor([0.5, -2.0]).double()
 CAPACITY, COOLING = [0.1, 0.05], 2.0
 
 
@@ -51,9 +68,14 @@ def truth(name: str) -> FrictionModel:
     return FrictionModel(law, schedule, V_SMOOTH).requires_grad_(False)
 
 
+def rig(name: str) -> PendulumChain:
+    plant = pendulum(normal_load="bearing")
+    return plant.replace(load_waves=WAVES, load_phase=PHASES) if name == "position" else plant
+
+
 @pytest.fixture(scope="module", params=TRUTHS)
 def recorded(request):
-    recording = swing(pendulum(normal_load="bearing"), truth(request.param), seconds=3.0)
+    recording = swing(rig(request.param), truth(request.param), seconds=3.0)
     return request.param, recording, fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
 
 
@@ -61,14 +83,19 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH)
     task = prepare_task(model, pendulum(), [recording], FitOptions(**BRIEF))
-    found, refitted = chosen_inputs(task, law)
+    found, refitted, seeing = chosen_inputs(task, law)
     assert (refitted is law) == (not found)
+    assert seeing.plant.has_position_load == any(gain.name == "position" for gain in found)
     if name == "nothing":
         assert all(gain.share < 0.2 for gain in found)
     else:
         assert found[0].name == name
         assert found[0].share > 0.5
         assert "unexplained" in found[0].words(("a", "b"))
+    if name == "position":
+        torch.testing.assert_close(refitted.plant.load_waves, WAVES)
+        off = (refitted.plant.load_phase - PHASES + math.pi) % (2 * math.pi) - math.pi
+        assert off.abs().max() < 0.1
 
 
 def test_the_fall_by_heat_is_recovered() -> None:
@@ -137,7 +164,7 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
         made.append(Contest(task, start, **rival))
         return made[-1]
 
-    monkeypatch.setattr(neurofuzzy.inputs, "chosen_inputs", lambda task, start: (gains, start))
+    monkeypatch.setattr(neurofuzzy.inputs, "chosen_inputs", lambda *given: (gains, *given[::-1]))
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
     monkeypatch.setattr(neurofuzzy.inputs, "drives", lambda found, own: driving and own == 2)
     plain = Contest(task, "law")
@@ -191,12 +218,13 @@ def test_evidence_is_the_integral_over_the_coefficient() -> None:
     choice, x = choice_of(-6.0), torch.linspace(-9.0, 9.0, 20001, dtype=torch.float64)
     density = torch.exp(6.0 * x - 2.0 * x**2) / (2.0 * torch.pi) ** 0.5
     expected = float(torch.trapezoid(density, x).log())
-    (after, cost), (before, whole) = choice.evidence([1]), choice.evidence([])
+    (after, cost, _), (before, whole, _) = choice.evidence([1]), choice.evidence([])
     assert after - before == pytest.approx(expected, rel=1e-9)
     assert (cost, whole) == pytest.approx((20.0 - 6.0 * 1.5 + 1.5 * 1.5**2, 20.0))
-    gain = choice.best([], 1.0)
-    assert gain is not None
-    assert gain.share == pytest.approx((6.0 * 1.5 - 1.5 * 1.5**2) / 20.0)
+    best = choice.best([], 1.0)
+    assert best is not None
+    assert best[0] == pytest.approx(after - before)
+    assert best[1].share == pytest.approx((6.0 * 1.5 - 1.5 * 1.5**2) / 20.0)
 
 
 def test_an_input_that_its_sign_forbids_has_no_evidence() -> None:
@@ -214,7 +242,7 @@ def test_an_input_is_chosen_beside_those_before() -> None:
     first, second = choice.best([], 0.0), choice.best(["heat"], -9.0)
     assert first is not None
     assert second is not None
-    assert (first.name, second.name) == ("heat", "load")
+    assert (first[1].name, second[1].name) == ("heat", "load")
     # It gains less than its coefficient costs.
     assert choice.best(["heat"], 0.0) is None
 
@@ -249,7 +277,7 @@ def test_the_load_of_a_motor_is_no_candidate() -> None:
     time = torch.arange(300).double().numpy() * 2e-3
     recording = Recording(time, 0.1 * np.sin(9.0 * time)[:, None])
     task = prepare_task(NFCVFM(1), rotor, [recording], FitOptions(**BRIEF))
-    assert candidates(task) == ("direction", "heat")
+    assert candidates(task) == ("direction", "position", "heat")
 
 
 def test_a_friction_of_the_load_is_simulated_with_the_loads_it_was_fitted_to(tmp_path) -> None:
@@ -271,3 +299,41 @@ def test_a_given_load_is_that_of_the_bearings(monkeypatch) -> None:
     recording = Recording(time, 0.1 * np.sin(9.0 * time)[:, None].repeat(2, 1))
     with pytest.raises(RuntimeError, match="bearing"):
         fit(NFCVFM(2, inputs=["load"]), pendulum(), recording, **BRIEF)
+
+
+def test_a_friction_of_the_position_is_simulated_with_the_positions_it_was_fitted_to() -> None:
+    start = torch.tensor([1.0, 0.5], dtype=torch.float64)
+    given = {"steps": 3, "sample_time": 1e-3, "gradients": False}
+    rollout(rig("position"), truth("position"), start, 0 * start, **given)
+    rollout(rig("position"), CVFM(2), start, 0 * start, **given)  # which has no load
+    with pytest.raises(ValueError, match="load of this plant does not follow the position"):
+        rollout(pendulum(), truth("position"), start, 0 * start, **given)
+    with pytest.raises(ValueError, match="that of the friction does not"):
+        rollout(rig("position"), LFM(2), start, 0 * start, **given)
+
+
+@pytest.mark.parametrize(("law", "inputs"), [(COULOMB_VISCOUS, ["load", "position"]),
+                                             (LINEAR, ["position"])])  # fmt: skip
+def test_position_and_load_exclude_each_other(law, inputs) -> None:
+    with pytest.raises(ValueError, match="replaces the load"):
+        with_inputs(law, inputs)
+
+
+def test_waves_of_an_axis_fit_into_its_stroke() -> None:
+    axis, stroke = LinearAxis(mass=2.0), 2.5
+    law = with_inputs(COULOMB_VISCOUS, ["position"])
+    rippled = axis.replace(load_waves=torch.tensor([2 * math.pi * 2 / stroke]).double(),
+                           load_phase=torch.tensor([1.0]).double())  # fmt: skip
+    true = FrictionModel(law, Constant(law, 1, [1.0, 2.0, 3.0]), V_SMOOTH).requires_grad_(False)
+    time = 2e-3 * np.arange(2000)
+    force = (12.0 * np.sin(5.0 * time) + 8.0 * np.sin(2.0 * time))[:-1, None]
+    begin = torch.zeros(1).double()
+    run = rollout(rippled, true, begin, begin, tau=torch.as_tensor(force), sample_time=2e-3,
+                  substeps=4, gradients=False)  # fmt: skip
+    q, rate = run.q.numpy(), float(rippled.load_waves)
+    recording = Recording(run.time.numpy(), q, np.vstack([force, force[-1:]]), unit="m")
+    law = fit(CVFM(1, v_smooth=V_SMOOTH), axis, recording, **BRIEF)
+    task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, [recording], FitOptions(**BRIEF))
+    possible = 2 * math.pi * np.array(TRIED) / np.ptp(q)
+    nearest = min(possible, key=lambda one: abs(one - rate))
+    assert float(placed(task, law).plant.load_waves) == pytest.approx(nearest, rel=1e-3)

@@ -169,7 +169,7 @@ def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None
         ({"head_units": 2.5}, "`head_units` must be a whole number"),
         (
             {"inputs": "load"},
-            "`inputs` must be different ones of direction, load, heat, got 'load'",
+            "`inputs` must be different ones of direction, load, position, heat, got 'load'",
         ),
     ],
 )

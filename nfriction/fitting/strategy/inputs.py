@@ -48,6 +48,8 @@ from nfriction.signals import Motion
 
 # Waves of friction per turn, or per stroke of an axis, in dependence on the position.
 WAVES = (1, 2, 3, 4)
+# Guesses about each joint before an input is tried: waves, and phase to a quarter of a turn.
+GUESSES = {"position": 4 * len(WAVES)}
 
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
@@ -55,6 +57,13 @@ def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
     if "load" not in inputs or not plant.has_link_load:
         return plant
     return from_dict({**plant.to_dict(), "normal_load": "bearing"})
+
+
+def with_waves_of(plant: Plant, other: Plant) -> Plant:
+    """The other plant, with loads that follow the position if those of the plant do."""
+    if not plant.has_position_load:
+        return other
+    return other.replace(load_waves=plant.load_waves, load_phase=plant.load_phase)
 
 
 def candidates(task: FitTask) -> tuple[str, ...]:
@@ -93,7 +102,7 @@ def placed(task: FitTask, start: FitResult) -> FitTask:
 
     def load(q: Tensor, qd: Tensor) -> Tensor:
         angle = rates * q[..., None]
-        return torch.cat([angle.cos(), angle.sin()], -1)
+        return torch.cat([torch.ones_like(q)[..., None], angle.cos(), angle.sin()], -1)
 
     def at(waves: Tensor, phases: Tensor) -> FitTask:
         return replace(task, plant=task.plant.replace(load_waves=waves, load_phase=phases))
@@ -101,24 +110,24 @@ def placed(task: FitTask, start: FitResult) -> FitTask:
     own, plants = start.model.law, [plant.replace() for plant in (task.plant, start.plant)]
     for plant in plants:
         plant.load = load  # type: ignore[method-assign]
-    names = [f"{part} {k}" for part in ("cosine", "sine") for k in WAVES]
+    names = ["dry", *(f"{part} {k}" for part in ("cosine", "sine") for k in WAVES)]
     waves = [Coefficient(name, "N m", positive=False, prior_scale=1.0) for name in names]
     law = Law(f"{own.name}_by_waves", (*own.coefficients, *waves), _WavesTorque(own))
-    fitter = _fitter(task, start, start, law, plants)
-    choice = _Choice.of(fitter, task, start, {name: name for name in names})
+    choice = _Choice.of(_fitter(task, start, law, plants), task, start, {n: n for n in names})
     if choice is None:
         one = torch.ones(task.plant.joints, dtype=torch.float64)
         return at(rates[0] * one, 0.0 * one)
-    pairs = torch.tensor([choice.columns[name] for name in names]).reshape(2, len(WAVES), -1)
-    choice = choice.with_noise_beside(pairs.flatten().tolist())
+    dry, *rest = (torch.tensor(choice.columns[name]) for name in names)
+    pairs = torch.stack(rest).reshape(2, len(WAVES), -1)
+    choice = choice.with_noise_beside([*dry.tolist(), *pairs.flatten().tolist()])
     best: list[int] = []
     for j in range(task.plant.joints):
         others = [p[:, best[i]] if i < j else p.flatten() for i, p in enumerate(pairs.unbind(-1))]
-        del others[j]
+        others[j] = dry
         tried = [torch.cat([*others, pair]).tolist() for pair in pairs[..., j].unbind(-1)]
         best.append(int(np.argmax([choice.evidence(columns)[0] for columns in tried])))
     chosen = pairs[:, best, range(len(best))]
-    cosine, sine = choice.evidence(chosen.flatten().tolist())[2][chosen]
+    cosine, sine = choice.evidence([*dry.tolist(), *chosen.flatten().tolist()])[2][chosen]
     return at(rates[best], torch.atan2(-sine, cosine))
 
 
@@ -161,30 +170,27 @@ def widened_fitter(
     """
     law, at = with_inputs(start.model.law, inputs), at or start
     plant, fitted = (seeing_plant(plant, inputs) for plant in (task.plant, at.plant))
-    if plant.has_position_load:
-        fitted = fitted.replace(load_waves=plant.load_waves, load_phase=plant.load_phase)
-    return _fitter(task, start, at, law, (plant, fitted), cooling_time)
+    return _fitter(task, at, law, (plant, with_waves_of(plant, fitted)), cooling_time)
 
 
 def _fitter(
-    task: FitTask, start: FitResult, at: FitResult, law: Law, plants: Sequence[Plant],
-    cooling_time: float = math.nan,
-) -> ShootingFitter:  # fmt: skip
+    task: FitTask, at: FitResult, law: Law, plants: Sequence[Plant], cooling_time: float = math.nan
+) -> ShootingFitter:
     """Fitter of constant coefficients of a law, on a plant as given and as fitted before."""
     plant, fitted = plants
     values = at.model.schedule.coefficient_sets()["always"].T
     known = dict(zip(at.model.law.names, values, strict=True))
     initial = torch.stack([known.get(name, 0.0 * values[0]) for name in law.names], -1)
-    schedule = Constant(law, start.model.joints, initial)
+    schedule = Constant(law, at.model.joints, initial)
     if is_heated(law):
         schedule = heated_schedule(law, initial, task.motions, cooling_time)
         if is_heated(at.model.law):
             seen = cast("Heated", at.model.schedule)
             schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
-    model = FrictionModel(law, schedule, start.model.v_smooth)
+    model = FrictionModel(law, schedule, at.model.v_smooth)
     terms = adjustable_terms(
         plant, law, task.recordings, task.options,
-        eccentric=fits_eccentricity(task.options, start), per_recording=bool(start.encoder_offsets),
+        eccentric=fits_eccentricity(task.options, at), per_recording=bool(at.encoder_offsets),
     )  # fmt: skip
     torque = regression(task, model, fitted)
     return ShootingFitter(
@@ -277,9 +283,9 @@ def chosen_inputs(
     """
     names, at, longest = candidates(task), start, longest_duration(task.motions)
     # Load and position exclude each other: the plant gives only one of them.
-    rivals = {"position": task}
-    if "position" in names:
-        rivals["load"] = placed(task, start)
+    rivals = {"load": placed(task, start)} if "position" in names else {}
+    if "load" in names or not rivals:
+        rivals["position"] = task
     chosen: list[InputGain] = []
     while True:
         found, held = [], [gain.name for gain in chosen]
@@ -365,17 +371,17 @@ class _Choice:
         """
         columns = [column for name in held for column in self.columns[name]]
         before, left, _ = self.evidence(columns)
-        found = {
-            name: self.evidence([*columns, *more])
-            for name, more in self.columns.items()
-            if name not in held
-        }
-        best = max(found, key=lambda name: found[name][0], default="")
-        if not (best and found[best][0] - before > least):
+        gained, costs = {}, {}
+        for name, more in self.columns.items():
+            if name not in held:
+                found, costs[name], _ = self.evidence([*columns, *more])
+                gained[name] = found - before - len(more) * math.log(GUESSES.get(name, 1))
+        best = max(gained, key=gained.__getitem__, default="")
+        if not (best and gained[best] > least):
             return None
         each = [self.evidence([*columns, column])[1] for column in self.columns[best]]
         by_joint = tuple(1.0 - alone / left for alone in each)
-        return found[best][0] - before, InputGain(best, 1.0 - found[best][1] / left, by_joint)
+        return gained[best], InputGain(best, 1.0 - costs[best] / left, by_joint)
 
     def evidence(self, held: Sequence[int]) -> tuple[float, float, Tensor]:
         """Log evidence with the columns `held`, up to a constant, cost of the errors, and step.

@@ -81,7 +81,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     widened = inputs.widened_start(aligned, start, given) if widens else start
     if widened is None:
         fitter = inputs.widened_fitter(aligned, start, given, inputs.longest_duration(motions))
-        start = replace(start, model=fitter.friction)
+        plant = inputs.with_waves_of(aligned.plant, start.plant)
+        start = replace(start, model=fitter.friction, plant=plant)
     contest = _Contest(aligned, widened or start)
     chosen: tuple[inputs.InputGain, ...] = ()
     model = task.model
@@ -101,6 +102,12 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
+    if found.plant.has_position_load:
+        names, unit = found.plant.joint_names, found.plant.unit
+        every = zip(names, (2.0 * math.pi / found.plant.load_waves).tolist(), strict=True)
+        said.append(
+            f"The ripple repeats every {', '.join(f'{x:.3g} {unit} ({n})' for n, x in every)}."
+        )
     if is_heated(model.law):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
