@@ -249,7 +249,7 @@ def adjustable_terms(
 ) -> list[PlantParameter]:
     """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    None repeats another parameter: no encoder offset if each recording has its own, no gear loss
+    No term repeats another parameter: no encoder offset if each recording has its own, no gear loss
     beside a law of the transmitted torque, no torque offset beside f_o. The torque's delay is last.
     """
     delay = [torque_delay_term(options)] if options.fit_delay else []
