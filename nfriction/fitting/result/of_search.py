@@ -54,11 +54,8 @@ def result_from_equation_error(
         for mask in (low | high, low & (lower.abs() <= NOTHING))
     )
     unidentifiable = certain.null_directions(fitted_names, known)
-    unidentifiable += tuple(
-        name
-        for name in certain.weakly_identified(fitted_names, values, known)
-        if not any(name in direction for direction in unidentifiable)
-    )
+    weak = certain.weakly_identified(fitted_names, values, known)
+    unidentifiable += tuple(name for name in weak if not any(name in d for d in unidentifiable))
     found = warnings_of(
         converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
     )
@@ -116,9 +113,7 @@ def result_from_shooting(
     return FitResult(
         model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
-        plant_terms=tuple(
-            (t.name, float(v), t.upper) for t, v in zip(terms, vector, strict=True)
-        ),
+        plant_terms=tuple((t.name, float(v), t.upper) for t, v in zip(terms, vector, strict=True)),
         status=result.message if result.converged else f"Not converged: {result.message}",
         converged=result.converged,
         residual=residual,
@@ -138,6 +133,7 @@ def result_from_shooting(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scale_warning(problem, intervals)
+        + rotor_warning(problem, at_bounds)
         + tuple(offset_warnings(problem, vector, intervals))
         + outlier_warning(outliers),
         outliers=outliers,
@@ -162,6 +158,15 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
         f"are wrong, or torques are recorded {1 + scale:.3g} times as large as they are (torque "
         "constant, gear ratio, unit); then so is the friction.",
     )
+
+
+def rotor_warning(problem: ShootingProblem, at_bounds: Sequence[str]) -> tuple[str, ...]:
+    """A sentence if a driven chain without rotors has an inertia or length at a bound."""
+    tau, own = problem.windows.tau, dict(problem.jacobian.plant.named_buffers())
+    bare = tau.any() and not own.get("armature", tau).any()
+    hit = any(name.startswith(("inertia", "length")) for name in at_bounds)
+    said = "The rig has no rotor inertia (`armature`, or that of a `motor`). With geared drives, "
+    return (said + "inertias and lengths may therefore be at a bound.",) if bare and hit else ()
 
 
 def offset_warnings(
