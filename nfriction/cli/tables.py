@@ -90,7 +90,8 @@ def _best(comparison: Comparison, best: str) -> str:
     # Without a limit no difference can be called insignificant.
     if len(tied) < 2 or limit is None:
         return found
-    others = ", ".join(name for name in tied if name != best)
+    rated = {n: f" ({fit.usability[0]})" for n, fit in comparison.fits.items()}
+    others = ", ".join(f"{name}{rated.get(name, '')}" for name in tied if name != best)
     return (
         f"{found}\nstatistically tied with {others} (differences below the limit of these data, "
         f"{1e3 * limit:.3g} m{comparison.unit}, are not meaningful); the simplest of them is "

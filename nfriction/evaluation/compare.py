@@ -185,14 +185,18 @@ class Comparison:
         """The model that predicts the test recordings best, `"no friction"` included.
 
         Judged by the free run over all joints and recordings; among models that are equal within a
-        thousandth, the one with the fewest parameters. None if there is no test recording, or
-        every free run diverged.
+        thousandth, the one with the fewest parameters; if fits within the limit of it are good,
+        one of these. None if there is no test recording, or every free run diverged.
         """
         if not self.test:
             return None
         rmse = self.table()["all"]
         if not np.isfinite(rmse.min()):
             return None
+        tied = rmse.min() + (self.limit() or 0.0)
+        good = [n for n, fit in self.fits.items() if fit.usability[0] == "good" and rmse[n] <= tied]
+        if good and rmse.idxmin() != NO_FRICTION:
+            rmse = rmse[good]
         return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
 
     def limit(

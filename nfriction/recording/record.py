@@ -277,11 +277,9 @@ class Recording:
         """
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
-        arrays, slides, remarks, of_motors = formats.table_arrays(
-            table,
-            columns,
-            degrees=degrees,
-            motor_factors=None if plant is None else plant.motor_factors,
+        factors = None if plant is None else plant.motor_factors
+        arrays, slides, remarks, of_motors, has_unit = formats.table_arrays(
+            table, columns, degrees=degrees, motor_factors=factors
         )
         if of_motors and plant is not None and arrays["q"].shape[1] > plant.first_link + 1:
             angles = AngleConvention.of(plant if convention is None else convention).angles
@@ -304,16 +302,13 @@ class Recording:
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
         # One text, because CSV comments and Parquet metadata cannot contain lists.
         names = [part.strip() for part in str(attributes.get("names", "")).split(",")]
-        recording = cls(
-            time=arrays["time"],
-            q=arrays["q"],
-            tau=arrays.get("tau"),
-            qd=arrays.get("qd"),
-            names=tuple(filter(None, names)),
-            convention=None if convention is None else AngleConvention.of(convention),
-            unit=unit,
-            name=name,
-        )
+        with warnings.catch_warnings():
+            # A wheel may turn far and fast; this doubt is about a missing unit.
+            if has_unit:
+                warnings.filterwarnings("ignore", ".*looks like degrees", RecordingWarning)
+            convention = None if convention is None else AngleConvention.of(convention)
+            label = tuple(filter(None, names))
+            recording = cls(**arrays, names=label, convention=convention, unit=unit, name=name)
         for finding, remedy in remarks:
             recording._warn(finding, remedy, stacklevel=3)
         return recording
@@ -360,14 +355,9 @@ class Recording:
         table = formats.read_table(path, list((columns or {}).values()))
         try:
             return cls.from_pandas(
-                table,
-                columns=columns,
-                degrees=degrees,
-                convention=convention,
-                unit=unit,
-                name=formats.stem(path) if name is None else name,
-                plant=plant,
-            )
+                table, columns=columns, degrees=degrees, convention=convention, unit=unit,
+                name=formats.stem(path) if name is None else name, plant=plant,
+            )  # fmt: skip
         except ValueError as error:
             raise ValueError(f"'{path}': {shortened(error, 2000)}") from error
 

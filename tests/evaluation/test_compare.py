@@ -9,7 +9,7 @@ import pytest
 
 from nfriction import LFM, NFLFM, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
-from nfriction.evaluation.compare import Comparison, coefficient_summary
+from nfriction.evaluation.compare import Comparison, Fits, coefficient_summary
 from nfriction.evaluation.parallel import Progress
 from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.papers.afem.adaptive import ALFM
@@ -292,6 +292,20 @@ def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
     assert all_alike.indistinguishable() == ("no friction", "NCFM", "LFM")
     assert scored(found, np.inf, **errors).limit() is None
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
+
+
+def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
+    found, _ = comparison
+    good = {n: dataclasses.replace(f, residual=0.0, converged=True) for n, f in found.fits.items()}
+    vague = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))
+    doubtful = dataclasses.replace(found, fits=Fits({**good, "LFM": vague}))
+    assert [fit.usability[0] for fit in doubtful.fits.values()] == ["good", "doubtful"]
+    near = scored(doubtful, 0.7, no_friction=5.0, NCFM=2.0, LFM=1.0)
+    assert near.best() == "NCFM"
+    assert near.indistinguishable() == ("NCFM", "LFM")
+    assert "best on test recordings: NCFM" in verdict(near)
+    assert "statistically tied with LFM (doubtful) (" in verdict(near)
+    assert scored(doubtful, 0.6, no_friction=5.0, NCFM=2.0, LFM=1.0).best() == "LFM"
 
 
 def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison):

@@ -127,7 +127,7 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
     assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
     # Friction depends on the delay, also that of a model which starts from such a fit.
     assert "F_c of joint1 0.8" in said
-    start = {"start": found, "windows": (0.5,), "max_steps": 1}
+    start = {"start": found, "windows": (0.5,), "max_steps": 9}
     by_class = fit(ACVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **start)
     for told in (found, by_class):
         assert told.usability[0] == "doubtful"

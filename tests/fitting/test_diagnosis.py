@@ -25,8 +25,9 @@ from nfriction import (
 )
 from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
 from nfriction.fitting.task import prepare_task
-from nfriction.signals import kalman_smoother
+from nfriction.signals import kalman_smoother, quantise
 from tests.evaluation.test_score import zeroed_in_a_pose
 from tests.fitting.recordings import pendulum, swing
 
@@ -542,7 +543,7 @@ def test_torques_of_a_wrong_scale_are_named(name):
     plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(0.5,))
-    assert any("as if torques were recorded 1.2 times too large" in w for w in found.warnings)
+    assert any("torques are recorded 1.2 times as large as they are" in w for w in found.warnings)
 
 
 def test_a_step_at_a_gap_is_no_spike():
@@ -590,6 +591,34 @@ def test_a_fit_says_whether_it_is_usable():
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
+
+
+@pytest.mark.filterwarnings("ignore:.*looks like degrees")
+def test_a_wheel_that_coasts_far_excuses_no_law():
+    """Most of its motion needs no torque, so even a wrong friction law follows it."""
+    time, speed = np.arange(2001) * 1e-2, [30.0]
+    for _ in range(10 * (len(time) - 1)):
+        # Dry friction, and drag of air in proportion to the square of the speed.
+        slowed = speed[-1] - 1e-3 / 0.08 * (0.06 + 4e-4 * speed[-1] ** 2)
+        speed.append(max(0.0, slowed))
+    angle = 1e-3 * (np.cumsum(speed) - np.array(speed) / 2)[::10]
+    wheel = Recording(time, quantise(angle[:, None], 4096))
+    found = fit("coulomb-viscous", Rotor(0.08), wheel)
+    (dry,) = (i for i in found.intervals if i.name == "F_c of joint1")
+    assert not dry.low < 0.06 < dry.high
+    assert found.residual < DOUBTFUL_ERROR * wheel.q.std()
+    assert found.usability[0] == "doubtful"
+
+
+@pytest.mark.parametrize("scale", [0.93, 1.0, 1.08])
+def test_a_torque_constant_within_its_tolerance_is_named_if_friction_leaves_its_interval(scale):
+    plant, q, tau = measured("motor")
+    recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
+    found = fit(CVFM(1), plant, recording, windows=(1.0,))
+    told = [warning for warning in found.warnings if "torque constant" in warning]
+    assert len(told) == (scale != 1.0)
+    for warning in told:
+        assert f"recorded {scale} times as large as they are" in warning
 
 
 @pytest.mark.slow

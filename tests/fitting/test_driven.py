@@ -262,3 +262,12 @@ def fitted_offset(plant, truth, recording, share):
     model = FrictionModel(law, Constant(law, 2), V_SMOOTH)
     fit(model, plant, recording, fit_plant=False, windows=(1.0,))
     return model.schedule.values[:, 0]
+
+
+@pytest.mark.parametrize("bare", [True, False])
+def test_a_rotor_inertia_that_the_rig_lacks_is_named_where_it_bends_other_terms(bare):
+    truth = geared().replace(armature=torch.tensor([0.03, 0.03], dtype=F64))
+    given = geared().replace(armature=(0.0 if bare else 0.9) * truth.armature)
+    recording = driven(truth, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), given, recording, windows=(0.5,), max_steps=20)
+    assert any("has no rotor inertia" in text for text in found.warnings) == bare

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LFM, NFLFM, LinearAxis, Recording, fit, rigs, rollout
+from nfriction import CVFM, LFM, NFLFM, LinearAxis, Recording, Rotor, fit, rigs, rollout
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.result.identifiability import (
     PIECE,
@@ -18,7 +18,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.uncertainty import torque_response
 from nfriction.fitting.strategy.neurofuzzy import Validation
-from nfriction.signals import kalman_smoother
+from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import flywheel
 
 F64 = torch.float64
@@ -73,6 +73,33 @@ def test_intervals_know_the_error_of_the_integration():
     for i, true in zip(found.intervals, truth, strict=True):
         # By rounding alone 2.6 standard deviations.
         assert abs(i.value - true) < 1.5 * i.sd < 1e-3 * true
+
+
+def stuck_half_the_time(seed: int, friction: dict[str, float]) -> Recording:
+    """A driven wheel of 0.02 kg m^2 that friction holds exactly, in steps of 0.2 ms."""
+    time, rng, h = np.arange(2001) / 250, np.random.default_rng(seed), 1 / 5000
+    waves = zip((0.7, 0.5, 0.3), (0.2, 0.5, 1.1), rng.uniform(0, 6.28, 3), strict=True)
+    torque = sum(a * np.sin(2 * np.pi * f * time + phase) for a, f, phase in waves)
+    q, v, angle = 0.0, 0.0, []
+    for given in torque:
+        angle.append(q)
+        for _ in range(20):
+            dry = friction["F_c"] + friction["F_d"] * np.exp(-((v / friction["v_s"]) ** 2))
+            free = v + h / 0.02 * given
+            slid = max(0.0, abs(free) - h / 0.02 * dry) / (1 + h / 0.02 * friction["F_v"])
+            q, v = q + h * (v + np.copysign(slid, free)) / 2, float(np.copysign(slid, free))
+    return Recording(time, quantise(np.array(angle)[:, None], 16384), tau=torque[:, None])
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_intervals_know_that_the_steps_limit_how_steep_the_sign_is(seed):
+    true = {"F_c": 0.35, "F_d": 0.2, "F_v": 0.12, "v_s": 0.2}
+    settings = {"windows": (0.5,), "fit_plant": False, "encoder_reference": "shared"}
+    found = fit("stribeck", Rotor(0.02), stuck_half_the_time(seed, true), **settings)
+    assert found.usability == ("good", "")
+    for i in found.intervals:
+        assert i.low < true[i.name.split(" of ")[0]] < i.high
+        assert i.high - i.low < 0.5 * i.value
 
 
 def test_the_noise_of_the_torque_counts_once(monkeypatch):

@@ -466,6 +466,26 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
             recording[wrong]
 
 
+@pytest.mark.parametrize(
+    ("column", "options", "told"),
+    [
+        ("position", {"columns": {"q1": "position:counts/4096"}}, 0),
+        ("position [deg]", {"columns": {"q1": "position [deg]"}}, 0),
+        ("q1", {"degrees": True}, 0),
+        ("q1", {}, 1),
+    ],
+)
+def test_a_wheel_whose_unit_is_stated_is_not_taken_for_one_in_degrees(
+    column: str, options: dict[str, Any], told: int
+) -> None:
+    time = 0.01 * np.arange(100)
+    table = pd.DataFrame({"time": time, column: np.rint(1e4 * np.sqrt(time)) / 2})
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        Recording.from_pandas(table, **options)
+    assert sum("degrees" in str(warning.message) for warning in said) == told
+
+
 def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
     time = np.arange(2000) * 1e-3
     whirling = 25.0 * time[:, None]

@@ -160,9 +160,13 @@ class FitResult:
         that hardly matter; noise is not an error of the model.
         """
         noise = math.inf if self.noise is None else self.noise
-        moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
+        falls, moves = weighs(self.plant), [m.q for m in self.motions]
+        if not falls:
+            # Uniform motion needs no torque, so a model that follows it explains nothing.
+            moves = [m.q - np.vander(m.time, 2) @ np.polyfit(m.time, m.q, 1) for m in self.motions]
+        moved = np.concatenate([q.var(axis=0) for q in moves] or [[math.inf]])
         # A joint that keeps turning over under gravity can be anywhere on its circle.
-        most = UNIFORM_TURN**2 if weighs(self.plant) else math.inf
+        most = UNIFORM_TURN**2 if falls else math.inf
         motion = math.sqrt(np.minimum(moved, most).mean())
         above = self.residual > DEFAULTS.model_error_ratio * noise
         wrong = above and self.residual > DOUBTFUL_ERROR * motion

@@ -8,20 +8,9 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
+from nfriction.fitting.result import identifiability as certain
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.identifiability import (
-    CoefficientUncertainty,
-    Information,
-    Interval,
-    confidence_intervals,
-    covariance_root,
-    exceeds_drive_torque,
-    model_error_warning,
-    null_directions,
-    standard_deviations,
-    warnings_of,
-    weakly_identified,
-)
+from nfriction.fitting.result.identifiability import Information, Interval, warnings_of
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting import uncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
@@ -58,18 +47,15 @@ def result_from_equation_error(
     values, lower, upper = (x[fitted] for x in (model.schedule.parameter_vector(), lower, upper))
     known = Information(torch.block_diag(*torque.information), torch.zeros(len(names)).double())
     known = known.subset(fitted)
-    sd = standard_deviations(known)
+    sd = certain.standard_deviations(known)
     low, high = values <= lower + NOTHING, values >= upper
     at_bounds, at_zero = (
         tuple(fitted_names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (low | high, low & (lower.abs() <= NOTHING))
     )
-    unidentifiable = null_directions(fitted_names, known)
-    unidentifiable += tuple(
-        name
-        for name in weakly_identified(fitted_names, values, known)
-        if not any(name in direction for direction in unidentifiable)
-    )
+    unidentifiable = certain.null_directions(fitted_names, known)
+    weak = certain.weakly_identified(fitted_names, values, known)
+    unidentifiable += tuple(name for name in weak if not any(name in d for d in unidentifiable))
     found = warnings_of(
         converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
     )
@@ -84,7 +70,7 @@ def result_from_equation_error(
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
-        intervals=confidence_intervals(fitted_names, values, sd, lower, upper),
+        intervals=certain.confidence_intervals(fitted_names, values, sd, lower, upper),
         unidentifiable=unidentifiable,
         warnings=(*found, BLURRED, *outlier_warning(torque.outliers)),
         outliers=torque.outliers,
@@ -127,9 +113,7 @@ def result_from_shooting(
     return FitResult(
         model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
-        plant_terms=tuple(
-            (t.name, float(v), t.upper) for t, v in zip(terms, vector, strict=True)
-        ),
+        plant_terms=tuple((t.name, float(v), t.upper) for t, v in zip(terms, vector, strict=True)),
         status=result.message if result.converged else f"Not converged: {result.message}",
         converged=result.converged,
         residual=residual,
@@ -145,14 +129,15 @@ def result_from_shooting(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero,
         )
-        + model_error_warning(
+        + certain.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scale_warning(problem, intervals)
+        + rotor_warning(problem, at_bounds)
         + tuple(offset_warnings(problem, vector, intervals))
         + outlier_warning(outliers),
         outliers=outliers,
-        uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
+        uncertainty=None if root is None else certain.CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
 
 
@@ -162,15 +147,26 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
     scale = sum(found) / len(found)
-    # A single term may be off by that much; the scale of a torque changes all of them.
-    alike = all(abs(x - scale) < ALIKE * abs(scale) for x in found)
-    if not alike or abs(scale) < problem.options.gain_term[1]:
+    terms = {term.name for term in problem.variables.terms}
+    friction = [i for i in intervals if i.name not in terms]
+    # Like a delay, a scale matters if it takes a coefficient out of its interval.
+    matters = not friction or any(not i.low <= i.value / (1 + scale) <= i.high for i in friction)
+    if not (matters and all(abs(x - scale) < ALIKE * abs(scale) for x in found)):
         return ()
     return (
-        f"Inertia and gravity are both {1 + scale:.3g} times those of the rig, as if torques were "
-        f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
-        "friction is also too large.",
+        f"Inertia and gravity are both {1 + scale:.3g} times those of the rig. Either its masses "
+        f"are wrong, or torques are recorded {1 + scale:.3g} times as large as they are (torque "
+        "constant, gear ratio, unit); then so is the friction.",
     )
+
+
+def rotor_warning(problem: ShootingProblem, at_bounds: Sequence[str]) -> tuple[str, ...]:
+    """A sentence if a driven chain without rotors has an inertia or length at a bound."""
+    tau, own = problem.windows.tau, dict(problem.jacobian.plant.named_buffers())
+    bare = tau.any() and not own.get("armature", tau).any()
+    hit = any(name.startswith(("inertia", "length")) for name in at_bounds)
+    said = "The rig has no rotor inertia (`armature`, or that of a `motor`). With geared drives, "
+    return (said + "inertias and lengths may therefore be at a bound.",) if bare and hit else ()
 
 
 def offset_warnings(
@@ -264,22 +260,24 @@ def _identifiability(
     known = uncertainty.gathered_information(problem, result.x, sd, quantum if rounded else None)
     known = known.subset(fitted)
     root = torch.zeros(count, len(fitted) + 1, dtype=torch.float64)
-    root[fitted] = torch.cat([covariance_root(known), off[fitted, None]], 1)
+    root[fitted] = torch.cat([certain.covariance_root(known), off[fitted, None]], 1)
     root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
-    intervals = confidence_intervals(
+    intervals = certain.confidence_intervals(
         [names[i] for i in shown.tolist()], result.x[shown], sd[shown], lower[shown], upper[shown]
     )
     unidentifiable: tuple[str, ...] = ()
     if constant:
         friction = fitted[fitted < friction_count]
         coefficients = fitted_names[: len(friction)]
-        unidentifiable = (*null_directions(fitted_names, known, options), *ambiguous)
+        unidentifiable = (*certain.null_directions(fitted_names, known, options), *ambiguous)
         slope, need = _torque_scale(problem, result, motions)
         weak = (
-            *weakly_identified(coefficients, result.x[friction], known, options),
-            *exceeds_drive_torque(coefficients, sd[friction], slope[friction], need[friction]),
+            *certain.weakly_identified(coefficients, result.x[friction], known, options),
+            *certain.exceeds_drive_torque(
+                coefficients, sd[friction], slope[friction], need[friction]
+            ),
         )
         unidentifiable += tuple(
             name for name in dict.fromkeys(weak) if not any(name in d for d in unidentifiable)

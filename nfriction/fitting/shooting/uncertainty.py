@@ -7,6 +7,7 @@ for many samples is not included, since it looks like an error of the law.
 """
 
 import math
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -15,15 +16,8 @@ from torch import Tensor
 
 from nfriction.fitting.result.identifiability import Information, information, observed_count
 from nfriction.fitting.robust_loss import SQUARES
+from nfriction.fitting.shooting import normal_equations as normal
 from nfriction.fitting.shooting.autocorrelation import white_noise
-from nfriction.fitting.shooting.normal_equations import (
-    Kept,
-    drawn_score,
-    marginalize_states,
-    normal_equations,
-    rounding_of,
-    score_covariance,
-)
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.inputs import is_heated
 from nfriction.optim.least_squares import LeastSquaresResult
@@ -88,7 +82,7 @@ def _once_fitted(problem: ShootingProblem, x: Tensor, response: Tensor) -> float
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
     rows = problem.rows(problem.simulate(x, with_memory=True), problem.scale)
-    gradient, hessian = normal_equations(rows, off, variables.indices(), len(x))
+    gradient, hessian = normal.normal_equations(rows, off, variables.indices(), len(x))
     gradient, hessian = gradient[free], hessian[free][:, free]
     hessian.diagonal().add_(variables.prior()[0][free])
     step, failed = torch.linalg.solve_ex(hessian, gradient)
@@ -116,15 +110,15 @@ def gathered_information(
     variables, run = problem.variables, problem.simulate(x, with_memory=True)
     shared, (precision, _) = variables.shared_count, variables.prior()
     of_states, of_offsets = variables.split(precision)[2:]
-    kept = Kept(variables.indices(), variables.state_count, len(x))
+    kept = normal.Kept(variables.indices(), variables.state_count, len(x))
     scale = problem.scale * problem.loss.weight(problem.deviation(x, run)).sqrt()
-    data, response = marginalize_states(problem.rows(run, scale), kept, of_states)
+    data, response = normal.marginalize_states(problem.rows(run, scale), kept, of_states)
     by_torque = torque_response(problem, x, DRAWS)
     if count and problem.loss is SQUARES:
         q = run.motion.q[:, :: problem.substeps] @ problem.measurement.T
-        drawn = rounding_of(q, count, problem.windows.spans) * problem.scale[..., None]
+        drawn = normal.rounding_of(q, count, problem.windows.spans) * problem.scale[..., None]
         score = kept.by_states(response, of_states)
-        score += drawn_score(problem.rows(run, scale), kept, response, drawn)
+        score += normal.drawn_score(problem.rows(run, scale), kept, response, drawn)
     else:
         share = 1.0
         if by_torque is not None:
@@ -134,10 +128,10 @@ def gathered_information(
             rest = power - _once_fitted(problem, x, by_torque[..., 0]) ** 2
             share = min(1.0, math.sqrt(max(rest, rounding(problem) ** 2) / power))
         rows = problem.rows(run, problem.scale * share * sd / problem.noise_sd)
-        score = score_covariance(rows, kept, response, of_states)
+        score = normal.score_covariance(rows, kept, response, of_states)
     if by_torque is not None:
         drawn = by_torque * problem.scale[..., None]
-        score += drawn_score(problem.rows(run, scale), kept, response, drawn)
+        score += normal.drawn_score(problem.rows(run, scale), kept, response, drawn)
     prior = torch.cat([precision[:shared], of_offsets.flatten()])
     return information(data + torch.diag(prior), prior, shared, score)
 
@@ -172,7 +166,8 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     """Change of the minimum if simulations had finer steps, to first order, like `result.x`.
 
     If friction changes sign within a step, the integration error is less than an encoder count, but
-    it is the same each time, so that averaging over samples does not remove it.
+    it is the same each time, so that averaging over samples does not remove it. If the steps limit
+    how steep the smoothed sign is, finer ones come with a steeper sign, which creeps less at rest.
     """
     variables, x = problem.variables, result.x
     if problem.friction.schedule.state_size and not is_heated(problem.friction.law):
@@ -181,12 +176,15 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
     finer = replace(problem, substeps=FINER * problem.substeps)
+    if problem.substeps >= problem.options.max_substeps:
+        finer = replace(finer, friction=deepcopy(problem.friction))
+        finer.friction.v_smooth /= FINER
     off = _positions(finer, x) - _positions(problem, x)
     run = problem.simulate(x, with_memory=True)
     weight = problem.loss.weight(problem.deviation(x, run))
     rows = problem.rows(run, problem.scale * weight.sqrt())
     scaled = off * problem.scale * weight.sqrt()
-    gradient, _ = normal_equations(rows, scaled, variables.indices(), len(x))
+    gradient, _ = normal.normal_equations(rows, scaled, variables.indices(), len(x))
     step, failed = torch.linalg.solve_ex(result.hessian[free][:, free], -gradient[free])
     moved = torch.zeros_like(x)
     if not failed and step.isfinite().all():

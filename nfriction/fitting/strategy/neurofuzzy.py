@@ -108,10 +108,12 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         said.append(
             f"The ripple repeats every {', '.join(f'{x:.3g} {unit} ({n})' for n, x in every)}."
         )
+    unmodelled = start.unmodelled
     if is_heated(model.law):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
+        unmodelled = tuple(text for text in unmodelled if text not in task.drift)
     found = replace(found, status=" ".join([found.status, *said]))
-    return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
+    return found.with_warnings(start.data_warnings, unmodelled=unmodelled)
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:

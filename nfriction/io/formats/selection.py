@@ -77,6 +77,7 @@ class Arrays(NamedTuple):
     slides: bool | None  # whether positions are lengths; None if unknown
     remarks: tuple[tuple[str, str], ...] = ()  # doubts about the columns, each with its remedy
     of_motors: bool = False  # positions follow from the angles of motors
+    has_unit: bool = False  # whether every position has a unit
 
 
 def table_arrays(
@@ -133,7 +134,8 @@ def table_arrays(
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
     remarks = (*undecided, *_remarks(table, sources, joints))
     of_motors = any(source.motor == "motor" for source in sources.values())
-    return Arrays(arrays, kinds.pop() if kinds else None, remarks, of_motors)
+    has_unit = degrees or all(source.unit for source in positions)
+    return Arrays(arrays, kinds.pop() if kinds else None, remarks, of_motors, has_unit)
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
