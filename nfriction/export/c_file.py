@@ -83,8 +83,6 @@ def c(
     contract = contract_of(model, controller, info, dtype=dtype)
     dialect = ControllerC(REALS[dtype], name)
     plant = None if info is None or info.rig is None else from_dict(info.rig)
-    if plant is not None:
-        model.check_loads(plant)
     code, header = source_of(controller, contract.description, dialect, name, plant)
     words = _words(contract, name)
     files = {

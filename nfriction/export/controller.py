@@ -23,6 +23,7 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.sampled import sampled
 from nfriction.io.files import numbers
 from nfriction.io.model_file import ModelInfo, require_model
+from nfriction.plant.rigs import from_dict
 from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.
@@ -51,11 +52,13 @@ def controller_of(
         cutoff_hz: cut-off of that filter [Hz].
 
     Raises:
-        ValueError: if a range or the limit is malformed, or a filter or a law with memory lacks
-            its sample time.
+        ValueError: if a range or the limit is malformed, a filter or a law with memory lacks its
+            sample time, or the rig gives other loads than the friction depends on.
     """
     info = info or ModelInfo()
     require_model(model)
+    if info.rig is not None:
+        model.check_loads(from_dict(info.rig))
     if model.law.memory is not None:
         if info.sample_time is None:
             raise ValueError(

@@ -92,7 +92,8 @@ def fit_damping_frictionloss(
         info: names and unit of the joints.
 
     Raises:
-        ValueError: if the motion has other joints than the model, or none of it moves.
+        ValueError: if the motion has other joints than the model, or none of it moves, or there is
+            no `load` for friction that depends on the position.
     """
     parts = [motions] if isinstance(motions, Motion) else list(motions)
     torques = [_torque(model, part, load) for part in parts]
@@ -252,6 +253,10 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
             "a model without memory, such as coulomb-viscous."
         )
     time, q, qd, qdd = map(torch.as_tensor, (motion.time, motion.q, motion.qd, motion.qdd))
+    if load is None and "F_p" in model.law.names:
+        raise ValueError(
+            "this friction depends on the position: give `load=plant.load`, with its fit's plant."
+        )
     weight = torch.ones_like(qd) if load is None else load(q, qd)
     schedule = model.schedule
     states = schedule.states(qd, qdd, time)

@@ -75,6 +75,8 @@ def prepare_task(
     # Checked before much time is spent on recordings.
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
+    if plant.has_position_load and "F_p" not in model.law.names:
+        plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
     joint = inputs.in_joint_coordinates(plant, given, model.joints)
     moved = inputs.smoothed_motions(joint, motions)
@@ -130,6 +132,7 @@ def prepare_task(
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:
     """Constant coefficients implied by the torques on a plant; see `fit_equation_error`."""
+    model.check_loads(plant)
     recordings = inputs.advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
         steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond

@@ -15,7 +15,7 @@ INPUTS = {
     # Friction that is larger in one direction than in the other; it vanishes at rest.
     "direction": Coefficient("F_t", "N m", positive=False, prior_scale=1.0),
     "load": Coefficient("F_n", "N m", prior_scale=1.0),
-    # In place of the load, and periodic: 1 at most.
+    # Replaces the load; it is periodic, between 0 and 1.
     "position": Coefficient("F_p", "N m", prior_scale=1.0),
     # Friction that falls with the heat of the joint, whose last coefficient is that heat.
     "heat": FALL,
@@ -92,7 +92,7 @@ def reads_load(law: Law) -> bool:
     """True of a law whose torque depends on the load."""
     one = torch.ones(1, 1, dtype=torch.float64)
     coefficients = one.expand(1, 1, len(law.names))
-    return not torch.equal(*(law.torque(one, k * one, coefficients, 1.0) for k in (1.0, 2.0)))
+    return not torch.equal(*(law.torque(one, k * one, coefficients, 1.0) for k in (0.5, 2.0)))
 
 
 def require_loads(law: Law, plant: object) -> None:
@@ -110,10 +110,9 @@ def require_loads(law: Law, plant: object) -> None:
             'or one with `normal_load` "bearing".'
         )
     placed = getattr(plant, "has_position_load", "position" in given)
+    has = ("normal loads", "loads that follow the position")
     if placed != ("position" in given) and (not placed or reads_load(law)):
-        is_not = ("", " does not") if placed else (" does not", "")
         raise ValueError(
-            f"the load of this plant{is_not[0]} follow the position, and that of the friction"
-            f"{is_not[1]}: take the plant of the same fit (`FitResult.plant`, "
-            "`nfriction.load_plant`)."
+            f"the friction depends on {has[not placed]}, and this plant gives {has[placed]}: take "
+            "the plant of the same fit (`FitResult.plant`, `nfriction.load_plant`)."
         )

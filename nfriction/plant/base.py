@@ -88,8 +88,8 @@ class Plant(nn.Module, ABC):
     optional: ClassVar[tuple[str, ...]]
 
     torque_offset: Tensor
-    load_waves: Tensor  # k, per radian or metre of position; loads follow the position if replaced
-    load_phase: Tensor  # p [rad], (joints,)
+    load_waves: Tensor  # k of each joint [1/rad; 1/m]; zero: `load` is the normal load
+    load_phase: Tensor  # p of each joint [rad]
     has_position_load: bool = False
     has_drag: bool = False
     first_link: int = 0
@@ -163,7 +163,7 @@ class Plant(nn.Module, ABC):
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Quantity other than speed on which the friction of each joint depends [-].
 
-        The normal load over that at rest; if `load_waves` was replaced, (1 + cos(k q + p)) / 2.
+        The normal load over that at rest; with `load_waves` k, (1 + cos(k q + p)) / 2 instead.
         """
         self._check(q=q, qd=qd)
         if self.has_position_load:
@@ -218,7 +218,8 @@ class Plant(nn.Module, ABC):
 
     def _note_replaced(self, names: Collection[str]) -> None:
         """Hook of `replace` for terms that are omitted while their buffers are zero."""
-        self.has_position_load = self.has_position_load or "load_waves" in names
+        if "load_waves" in names:
+            self.has_position_load = bool(self.load_waves.any())
 
     def _check(self, **states: Tensor) -> None:
         for name, value in states.items():

@@ -18,13 +18,10 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.export import c
+from nfriction.export import c, mjcf, onnx, torchscript
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
-from nfriction.fitting.strategy.inputs import (
-    WAVES as TRIED,
-)
 from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
@@ -319,10 +316,30 @@ def test_a_friction_of_the_position_is_simulated_with_the_positions_it_was_fitte
     given = {"steps": 3, "sample_time": 1e-3, "gradients": False}
     rollout(rig("position"), truth("position"), start, 0 * start, **given)
     rollout(rig("position"), CVFM(2), start, 0 * start, **given)  # which has no load
-    with pytest.raises(ValueError, match="load of this plant does not follow the position"):
+    with pytest.raises(ValueError, match="depends on loads that follow the position"):
         rollout(pendulum(), truth("position"), start, 0 * start, **given)
-    with pytest.raises(ValueError, match="that of the friction does not"):
+    with pytest.raises(ValueError, match="depends on normal loads"):
         rollout(rig("position"), LFM(2), start, 0 * start, **given)
+
+
+def test_a_fit_takes_normal_loads_on_the_plant_of_a_fit_by_position() -> None:
+    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
+    found, plain = (fit(LFM(2), plant, recording, **BRIEF) for plant in (rig("position"),
+                    pendulum(normal_load="bearing")))  # fmt: skip
+    assert not found.plant.has_position_load
+    assert found.residual == plain.residual
+    with pytest.raises(ValueError, match="depends on loads that follow the position"):
+        fit(truth("position"), pendulum(), recording, **BRIEF)
+
+
+def test_exports_refuse_a_rig_with_other_loads(tmp_path) -> None:
+    model, info = truth("position"), ModelInfo(rig=pendulum().to_dict())
+    for write in (torchscript, onnx):
+        with pytest.raises(ValueError, match="depends on loads that follow the position"):
+            write(model, tmp_path / "model", info)
+    still = np.zeros((9, 2))
+    with pytest.raises(ValueError, match="depends on the position"):
+        mjcf(model, tmp_path / "model.xml", Motion(0.1 * np.arange(9.0), still, still + 1.0, still))
 
 
 @pytest.mark.parametrize(("law", "inputs"), [(COULOMB_VISCOUS, ["load", "position"]),
@@ -347,6 +364,6 @@ def test_waves_of_an_axis_fit_into_its_stroke() -> None:
     recording = Recording(run.time.numpy(), q, np.vstack([force, force[-1:]]), unit="m")
     law = fit(CVFM(1, v_smooth=V_SMOOTH), axis, recording, **BRIEF)
     task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, [recording], FitOptions(**BRIEF))
-    possible = 2 * math.pi * np.array(TRIED) / np.ptp(q)
+    possible = 2 * math.pi * np.arange(1, 5) / np.ptp(q)
     nearest = min(possible, key=lambda one: abs(one - rate))
     assert float(placed(task, law).plant.load_waves) == pytest.approx(nearest, rel=1e-3)

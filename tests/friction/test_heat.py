@@ -175,9 +175,10 @@ def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
         warming().schedule.set_heat([1.0, 2.0, 3.0], 1.0, 1.0)
 
 
-def test_the_papers_network_refuses_heat() -> None:
-    with pytest.raises(ValueError, match='needs `network="anfis"`'):
-        NFCVFM(1, network="rbf", inputs=["heat"])
+@pytest.mark.parametrize("name", ["heat", "position"])
+def test_the_papers_network_refuses_inputs_that_a_fit_has_to_find(name) -> None:
+    with pytest.raises(ValueError, match=f'"{name}" needs `network="anfis"`'):
+        NFCVFM(1, network="rbf", inputs=[name])
 
 
 def test_without_heat_nothing_is_remembered() -> None:

@@ -252,11 +252,11 @@ def adjustable_terms(
     No term repeats another parameter: no encoder offset if each recording has its own, no gear loss
     beside a law of the transmitted torque, no torque offset beside f_o. The torque's delay is last.
     """
-    delay = [torque_delay_term(options)] if options.fit_delay else []
-    # Of the friction, whether the plant is fitted or not.
-    delay = [*position_terms(plant), *delay] if plant.has_position_load else delay
+    # Phases belong to the friction and delays to the log: they are fitted on any plant.
+    others = position_terms(plant) if "F_p" in law.names else []
+    others += [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
-        return delay
+        return others
     largest = largest_torques(joint)
     # Over spans that are long compared with one encoder count.
     spans = [max(1, len(r) // 200) for r in joint]
@@ -272,7 +272,7 @@ def adjustable_terms(
     )  # fmt: skip
     repeated = {"angle_offset": per_recording, "gear_loss": law.reads_drive,
                 "torque_offset": "f_o" in law.names}  # fmt: skip
-    return [t for t in terms if not any(repeated.get(name) for name in t.change)] + delay
+    return [t for t in terms if not any(repeated.get(name) for name in t.change)] + others
 
 
 def advanced_torques(recordings: Sequence[Recording], delay: float) -> list[Recording]:
@@ -318,7 +318,7 @@ def integration_substeps(
     if needed > most:
         logger.warning(
             "near rest a sample needs %d integration steps, fits take %d; use v_smooth >= %.2g "
-            "(now %.2g), or a model by its name, for which a fit chooses it",
+            "(now %.2g), or a higher sample rate (a fit of a model by name chooses v_smooth)",
             needed, most, model.v_smooth * needed / most, model.v_smooth,
         )  # fmt: skip
     # Twice the present need, because coefficients may grow during the search.

@@ -98,9 +98,10 @@ def result_from_shooting(
     hit = (result.at_lower | result.at_upper)[:count] & (lower < upper)
     least = lower.abs() <= NOTHING
     least[count - len(terms) :] = torch.tensor([t.to_none for t in terms], dtype=torch.bool)
-    at_bounds, at_zero = (
+    at_upper = hit & result.at_upper[:count]
+    at_bounds, at_zero, full = (
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
-        for mask in (hit, hit & result.at_lower[:count] & least)
+        for mask in (hit, hit & result.at_lower[:count] & least, at_upper)
     )
     residuals = problem.errors(x)
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
@@ -133,7 +134,7 @@ def result_from_shooting(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scale_warning(problem, intervals)
-        + rotor_warning(problem, at_bounds)
+        + rotor_warning(problem, at_bounds, full)
         + tuple(offset_warnings(problem, vector, intervals))
         + outlier_warning(outliers),
         outliers=outliers,
@@ -147,24 +148,30 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
     scale = sum(found) / len(found)
-    terms = {term.name for term in problem.variables.terms}
-    friction = [i for i in intervals if i.name not in terms]
-    # Like a delay, a scale matters if it takes a coefficient out of its interval.
-    matters = not friction or any(not i.low <= i.value / (1 + scale) <= i.high for i in friction)
+    # Like a delay, a scale matters if it takes a coefficient of torque out of its interval.
+    # Networks have no such intervals.
+    law, least = problem.friction.law.coefficients, problem.options.gain_term[1]
+    of_torque = tuple(f"{c.name} of" for c in law if c.unit.startswith("N"))
+    friction = [i for i in intervals if i.name.startswith(of_torque)]
+    out = any(not i.low <= i.value / (1 + scale) <= i.high for i in friction)
+    matters = out if friction else abs(scale) >= least
     if not (matters and all(abs(x - scale) < ALIKE * abs(scale) for x in found)):
         return ()
     return (
-        f"Inertia and gravity are both {1 + scale:.3g} times those of the rig. Either its masses "
-        f"are wrong, or torques are recorded {1 + scale:.3g} times as large as they are (torque "
+        f"Inertia and gravity are both {1 + scale:.4g} times those of the rig. Either its masses "
+        f"are wrong, or torques are recorded {1 + scale:.4g} times as large as they are (torque "
         "constant, gear ratio, unit); then so is the friction.",
     )
 
 
-def rotor_warning(problem: ShootingProblem, at_bounds: Sequence[str]) -> tuple[str, ...]:
-    """A sentence if a driven chain without rotors has an inertia or length at a bound."""
+def rotor_warning(
+    problem: ShootingProblem, at_bounds: Sequence[str], at_upper: Sequence[str]
+) -> tuple[str, ...]:
+    """A sentence if a driven chain without rotors has a length or largest inertia at a bound."""
     tau, own = problem.windows.tau, dict(problem.jacobian.plant.named_buffers())
     bare = tau.any() and not own.get("armature", tau).any()
-    hit = any(name.startswith(("inertia", "length")) for name in at_bounds)
+    largest = any(name.startswith("inertia") for name in at_upper)
+    hit = largest or any(name.startswith("length") for name in at_bounds)
     said = "The rig has no rotor inertia (`armature`, or that of a `motor`). With geared drives, "
     return (said + "inertias and lengths may therefore be at a bound.",) if bare and hit else ()
 

@@ -46,10 +46,11 @@ from nfriction.plant import PendulumChain, Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.signals import Motion
 
-# Waves of friction per turn, or per stroke of an axis, in dependence on the position.
+# Waves of friction over the position, per turn or per stroke of an axis.
 WAVES = (1, 2, 3, 4)
-# Guesses about each joint before an input is tried: waves, and phase to a quarter of a turn.
-GUESSES = {"position": 4 * len(WAVES)}
+# Alternatives among which an input is chosen for each joint: waves, and a quarter of a turn for the
+# phase. The choice costs the logarithm of their number in evidence.
+ALTERNATIVES = {"position": 4 * len(WAVES)}
 
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
@@ -97,7 +98,8 @@ def placed(task: FitTask, start: FitResult) -> FitTask:
     All waves and joints are fitted at once; then each joint keeps the wave that it needs most.
     """
     # Waves of an axis fit into its stroke.
-    turn = 2 * math.pi if task.plant.unit == "rad" else max(np.ptp(m.q) for m in task.motions)
+    stroke = float(np.ptp(np.concatenate([m.q for m in task.motions])))
+    turn = 2 * math.pi if task.plant.unit == "rad" else stroke
     rates = 2 * math.pi / turn * torch.tensor(WAVES, dtype=torch.float64)
 
     def load(q: Tensor, qd: Tensor) -> Tensor:
@@ -282,34 +284,30 @@ def chosen_inputs(
         StoppedError: if the caller stops a search.
     """
     names, at, longest = candidates(task), start, longest_duration(task.motions)
-    # Load and position exclude each other: the plant gives only one of them.
-    rivals = {"load": placed(task, start)} if "position" in names else {}
-    if "load" in names or not rivals:
-        rivals["position"] = task
+    # Load and position exclude each other, as a plant gives only one of them.
+    tasks = {"position": placed(task, start)} if "position" in names else {}
+    if "load" in names or not tasks:
+        tasks["load"] = task
     chosen: list[InputGain] = []
+    seeing = task
     while True:
         found, held = [], [gain.name for gain in chosen]
-        for other, one in rivals.items():
-            open_ = [name for name in names if name != other]
-            fitter = widened_fitter(one, start, open_, longest, at)
-            choice = _Choice.of(fitter, one, at, {name: INPUTS[name].name for name in open_})
+        for kind, one in tasks.items():
+            tried = {n: INPUTS[n].name for n in names if n == kind or n not in ("load", "position")}
+            choice = _Choice.of(widened_fitter(one, start, [*tried], longest, at), one, at, tried)
             best = choice.best(held, task.options.evidence_gain) if choice else None
-            found += [(*best, other)] if best else []
+            found += [(*best, kind)] if best else []
         if not found:
-            break
-        _, gain, other = max(found, key=lambda one: one[0])
+            return tuple(chosen), at, seeing
+        _, gain, kind = max(found, key=lambda one: one[0])
         chosen.append(gain)
-        if gain.name in ("load", "position"):
-            rivals = {other: rivals[other]}
-        inputs = [gain.name for gain in chosen]
-        seeing = rivals["load"] if "position" in inputs else task
-        widened = widened_start(seeing, start, inputs)
+        if gain.name == kind:
+            tasks = {kind: tasks[kind]}
+            seeing = replace(tasks[kind], plant=seeing_plant(tasks[kind].plant, [kind]))
+        widened = widened_start(seeing, start, [gain.name for gain in chosen])
         if widened is None:
             raise StoppedError
         at = widened
-    held = [gain.name for gain in chosen]
-    seeing = rivals["load"] if "position" in held else task
-    return tuple(chosen), at, replace(seeing, plant=seeing_plant(seeing.plant, held))
 
 
 @dataclass(frozen=True)
@@ -375,7 +373,7 @@ class _Choice:
         for name, more in self.columns.items():
             if name not in held:
                 found, costs[name], _ = self.evidence([*columns, *more])
-                gained[name] = found - before - len(more) * math.log(GUESSES.get(name, 1))
+                gained[name] = found - before - len(more) * math.log(ALTERNATIVES.get(name, 1))
         best = max(gained, key=gained.__getitem__, default="")
         if not (best and gained[best] > least):
             return None

@@ -51,6 +51,7 @@ from nfriction.friction.inputs import is_heated
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -102,18 +103,22 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
-    if found.plant.has_position_load:
-        names, unit = found.plant.joint_names, found.plant.unit
-        every = zip(names, (2.0 * math.pi / found.plant.load_waves).tolist(), strict=True)
-        said.append(
-            f"The ripple repeats every {', '.join(f'{x:.3g} {unit} ({n})' for n, x in every)}."
-        )
+    if "F_p" in model.law.names and widened is not None:
+        said.append(_ripple(found.plant))
     unmodelled = start.unmodelled
     if is_heated(model.law):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
         unmodelled = tuple(text for text in unmodelled if text not in task.drift)
     found = replace(found, status=" ".join([found.status, *said]))
     return found.with_warnings(start.data_warnings, unmodelled=unmodelled)
+
+
+def _ripple(plant: Plant) -> str:
+    """A sentence about the positions where friction is largest."""
+    rows = zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)
+    peaks = (f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in rows)
+    at = ", ".join(peaks)
+    return f"Friction by position is largest at {at}, as long as encoders keep their zeros."
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:

@@ -15,6 +15,7 @@ from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import StoppedError, verdict
+from nfriction.fitting.strategy.inputs import seeing_plant
 from nfriction.fitting.strategy.neurofuzzy import INTERRUPTED, Validation, constant_kept
 from nfriction.fitting.task import FitTask, constant_prior, regression
 from nfriction.friction.neurofuzzy import LEAST_RATIO, PRIOR_SD
@@ -37,6 +38,7 @@ def fit_rbf(task: FitTask) -> FitResult:
     """
     require_motion(task.plant, task.recordings)
     model, options = task.model.requires_grad_(False), task.options
+    task = replace(task, plant=seeing_plant(task.plant, getattr(model, "inputs", None) or ()))
     schedule = model.schedule
     assert isinstance(schedule, RBFCoefficients)
     start = constant_start(task)
