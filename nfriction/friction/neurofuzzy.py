@@ -513,7 +513,7 @@ class NeuroFuzzyModel(NamedModel):
             raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
         made: Callable[..., Schedule] = resolve_name(NETWORKS[network])
         require_options(f"network {network!r}", made, options, ("network", "inputs"))
-        for name in {"heat", "position"} if made is not NeuroFuzzy else ():
+        for name in ("heat", "position") if made is not NeuroFuzzy else ():
             if INPUTS[name] in args[0].coefficients:
                 raise ValueError(f'the input "{name}" needs `network="anfis"`, got {network!r}.')
         if is_heated(args[0]):
