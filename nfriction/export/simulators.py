@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.friction.inputs import has_input
 from nfriction.friction.memory import DAHL, LUGRE
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
@@ -253,10 +254,8 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
             "a model without memory, such as coulomb-viscous."
         )
     time, q, qd, qdd = map(torch.as_tensor, (motion.time, motion.q, motion.qd, motion.qdd))
-    if load is None and "F_p" in model.law.names:
-        raise ValueError(
-            "this friction depends on the position: give `load=plant.load`, with its fit's plant."
-        )
+    if load is None and has_input(model.law, "position"):
+        raise ValueError("friction by position needs `load=plant.load`, of the plant of its fit.")
     weight = torch.ones_like(qd) if load is None else load(q, qd)
     schedule = model.schedule
     states = schedule.states(qd, qdd, time)

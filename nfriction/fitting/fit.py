@@ -19,7 +19,7 @@ from pathlib import Path
 from nfriction.fitting.options import Eccentricity, EncoderReference, FitOptions, Loss, Method
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.task import Callback, FitTask, prepare_task
-from nfriction.friction.inputs import is_heated
+from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import RecordingLike
@@ -111,5 +111,5 @@ def fit(
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     found = strategy(task)
-    unmodelled = task.play if is_heated(found.model.law) else (*task.drift, *task.play)
+    unmodelled = task.play if has_input(found.model.law, "heat") else (*task.drift, *task.play)
     return found.with_warnings(task.data_warnings, task.mistakes, unmodelled)

@@ -14,6 +14,7 @@ from nfriction.fitting.data import inputs
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import PendulumChain, Plant, rigs
@@ -75,7 +76,7 @@ def prepare_task(
     # Checked before much time is spent on recordings.
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
-    if plant.has_position_load and "F_p" not in model.law.names:
+    if plant.has_position_load and not has_input(model.law, "position"):
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
     joint = inputs.in_joint_coordinates(plant, given, model.joints)

@@ -83,9 +83,9 @@ class _WithInputs(nn.Module):
         return tau_f
 
 
-def is_heated(law: Law) -> bool:
-    """True of a law with the input `"heat"`, whose coefficients have a hidden state."""
-    return isinstance(law.torque, _WithInputs) and law.torque.heated
+def has_input(law: Law, name: str) -> bool:
+    """True of a law with a further input; with `"heat"` its coefficients have a hidden state."""
+    return isinstance(law.torque, _WithInputs) and name in law.torque.given
 
 
 def reads_load(law: Law) -> bool:
@@ -102,17 +102,17 @@ def require_loads(law: Law, plant: object) -> None:
         ValueError: if the law has the input `"load"` and the plant gives the loads of links, or if
             only one of them depends on the position.
     """
-    given = law.torque.given if isinstance(law.torque, _WithInputs) else ()
-    if "load" in given and getattr(plant, "has_link_load", False):
+    if has_input(law, "load") and getattr(plant, "has_link_load", False):
         raise ValueError(
             "the friction depends on the loads of the bearings, and this plant gives those of "
             "single links: take the plant of the fit (`FitResult.plant`, `nfriction.load_plant`), "
             'or one with `normal_load` "bearing".'
         )
-    placed = getattr(plant, "has_position_load", "position" in given)
-    has = ("normal loads", "loads that follow the position")
-    if placed != ("position" in given) and (not placed or reads_load(law)):
+    by_position = has_input(law, "position")
+    placed = getattr(plant, "has_position_load", by_position)
+    loads = ("normal loads", "loads that follow the position")
+    if placed != by_position and (not placed or reads_load(law)):
         raise ValueError(
-            f"the friction depends on {has[not placed]}, and this plant gives {has[placed]}: take "
+            f"the friction depends on {loads[not placed]}, this plant gives {loads[placed]}: take "
             "the plant of the same fit (`FitResult.plant`, `nfriction.load_plant`)."
         )

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.heat import Heated
-from nfriction.friction.inputs import INPUTS, is_heated, with_inputs
+from nfriction.friction.inputs import has_input, with_inputs
 from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
 from nfriction.friction.parameters import Sensitivity, as_tensor, positive_number, require_options
@@ -513,10 +513,10 @@ class NeuroFuzzyModel(NamedModel):
             raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
         made: Callable[..., Schedule] = resolve_name(NETWORKS[network])
         require_options(f"network {network!r}", made, options, ("network", "inputs"))
-        for name in ("heat", "position") if made is not NeuroFuzzy else ():
-            if INPUTS[name] in args[0].coefficients:
+        for name in ("heat", "position"):
+            if made is not NeuroFuzzy and has_input(args[0], name):
                 raise ValueError(f'the input "{name}" needs `network="anfis"`, got {network!r}.')
-        if is_heated(args[0]):
+        if has_input(args[0], "heat"):
             made = HeatedNeuroFuzzy
         return made(*args, **options)
 

@@ -338,7 +338,7 @@ def test_exports_refuse_a_rig_with_other_loads(tmp_path) -> None:
         with pytest.raises(ValueError, match="depends on loads that follow the position"):
             write(model, tmp_path / "model", info)
     still = np.zeros((9, 2))
-    with pytest.raises(ValueError, match="depends on the position"):
+    with pytest.raises(ValueError, match="by position needs `load"):
         mjcf(model, tmp_path / "model.xml", Motion(0.1 * np.arange(9.0), still, still + 1.0, still))
 
 

@@ -26,6 +26,7 @@ from nfriction.fitting.plant_parameters import (
     torque_delay_term,
 )
 from nfriction.friction import model_by_name
+from nfriction.friction.inputs import has_input
 from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
@@ -253,7 +254,7 @@ def adjustable_terms(
     beside a law of the transmitted torque, no torque offset beside f_o. The torque's delay is last.
     """
     # Phases belong to the friction and delays to the log: they are fitted on any plant.
-    others = position_terms(plant) if "F_p" in law.names else []
+    others = position_terms(plant) if has_input(law, "position") else []
     others += [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
         return others

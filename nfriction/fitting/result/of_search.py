@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
-from nfriction.fitting.result import identifiability as certain
+from nfriction.fitting.result import identifiability
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.identifiability import Information, Interval, warnings_of
+from nfriction.fitting.result.identifiability import CoefficientUncertainty, Information, Interval
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting import uncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
@@ -47,16 +47,16 @@ def result_from_equation_error(
     values, lower, upper = (x[fitted] for x in (model.schedule.parameter_vector(), lower, upper))
     known = Information(torch.block_diag(*torque.information), torch.zeros(len(names)).double())
     known = known.subset(fitted)
-    sd = certain.standard_deviations(known)
+    sd = identifiability.standard_deviations(known)
     low, high = values <= lower + NOTHING, values >= upper
     at_bounds, at_zero = (
         tuple(fitted_names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (low | high, low & (lower.abs() <= NOTHING))
     )
-    unidentifiable = certain.null_directions(fitted_names, known)
-    weak = certain.weakly_identified(fitted_names, values, known)
+    unidentifiable = identifiability.null_directions(fitted_names, known)
+    weak = identifiability.weakly_identified(fitted_names, values, known)
     unidentifiable += tuple(name for name in weak if not any(name in d for d in unidentifiable))
-    found = warnings_of(
+    found = identifiability.warnings_of(
         converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
     )
     return FitResult(
@@ -70,7 +70,7 @@ def result_from_equation_error(
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
-        intervals=certain.confidence_intervals(fitted_names, values, sd, lower, upper),
+        intervals=identifiability.confidence_intervals(fitted_names, values, sd, lower, upper),
         unidentifiable=unidentifiable,
         warnings=(*found, BLURRED, *outlier_warning(torque.outliers)),
         outliers=torque.outliers,
@@ -98,10 +98,10 @@ def result_from_shooting(
     hit = (result.at_lower | result.at_upper)[:count] & (lower < upper)
     least = lower.abs() <= NOTHING
     least[count - len(terms) :] = torch.tensor([t.to_none for t in terms], dtype=torch.bool)
-    at_upper = hit & result.at_upper[:count]
-    at_bounds, at_zero, full = (
+    at_lower, at_upper = (hit & end[:count] for end in (result.at_lower, result.at_upper))
+    at_bounds, at_zero, at_most = (
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
-        for mask in (hit, hit & result.at_lower[:count] & least, at_upper)
+        for mask in (hit, at_lower & least, at_upper)
     )
     residuals = problem.errors(x)
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
@@ -126,24 +126,24 @@ def result_from_shooting(
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
-        warnings=warnings_of(
+        warnings=identifiability.warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero,
         )
-        + certain.model_error_warning(
+        + identifiability.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scale_warning(problem, intervals)
-        + rotor_warning(problem, at_bounds, full)
+        + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals))
         + outlier_warning(outliers),
         outliers=outliers,
-        uncertainty=None if root is None else certain.CoefficientUncertainty(model.schedule, root),
+        uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
 
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """A sentence if a whole driven rig seems heavier or lighter: then the torques are wrong."""
+    """A sentence if a whole driven rig seems heavier or lighter: masses or torques are wrong."""
     found = list(_relative_weights(problem.jacobian.plant, intervals))
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
@@ -165,12 +165,12 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
 
 
 def rotor_warning(
-    problem: ShootingProblem, at_bounds: Sequence[str], at_upper: Sequence[str]
+    problem: ShootingProblem, at_bounds: Sequence[str], at_most: Sequence[str]
 ) -> tuple[str, ...]:
     """A sentence if a driven chain without rotors has a length or largest inertia at a bound."""
     tau, own = problem.windows.tau, dict(problem.jacobian.plant.named_buffers())
     bare = tau.any() and not own.get("armature", tau).any()
-    largest = any(name.startswith("inertia") for name in at_upper)
+    largest = any(name.startswith("inertia") for name in at_most)
     hit = largest or any(name.startswith("length") for name in at_bounds)
     said = "The rig has no rotor inertia (`armature`, or that of a `motor`). With geared drives, "
     return (said + "inertias and lengths may therefore be at a bound.",) if bare and hit else ()
@@ -267,22 +267,23 @@ def _identifiability(
     known = uncertainty.gathered_information(problem, result.x, sd, quantum if rounded else None)
     known = known.subset(fitted)
     root = torch.zeros(count, len(fitted) + 1, dtype=torch.float64)
-    root[fitted] = torch.cat([certain.covariance_root(known), off[fitted, None]], 1)
+    root[fitted] = torch.cat([identifiability.covariance_root(known), off[fitted, None]], 1)
     root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
-    intervals = certain.confidence_intervals(
+    intervals = identifiability.confidence_intervals(
         [names[i] for i in shown.tolist()], result.x[shown], sd[shown], lower[shown], upper[shown]
     )
     unidentifiable: tuple[str, ...] = ()
     if constant:
         friction = fitted[fitted < friction_count]
         coefficients = fitted_names[: len(friction)]
-        unidentifiable = (*certain.null_directions(fitted_names, known, options), *ambiguous)
+        unidentifiable = identifiability.null_directions(fitted_names, known, options)
+        unidentifiable += tuple(ambiguous)
         slope, need = _torque_scale(problem, result, motions)
         weak = (
-            *certain.weakly_identified(coefficients, result.x[friction], known, options),
-            *certain.exceeds_drive_torque(
+            *identifiability.weakly_identified(coefficients, result.x[friction], known, options),
+            *identifiability.exceeds_drive_torque(
                 coefficients, sd[friction], slope[friction], need[friction]
             ),
         )

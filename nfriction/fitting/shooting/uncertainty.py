@@ -19,7 +19,7 @@ from nfriction.fitting.robust_loss import SQUARES
 from nfriction.fitting.shooting import normal_equations as normal
 from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.friction.inputs import is_heated
+from nfriction.friction.inputs import has_input
 from nfriction.optim.least_squares import LeastSquaresResult
 
 # Counts per turn of a coarse encoder that is still in use.
@@ -170,7 +170,7 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     how steep the smoothed sign is, finer ones come with a steeper sign, which creeps less at rest.
     """
     variables, x = problem.variables, result.x
-    if problem.friction.schedule.state_size and not is_heated(problem.friction.law):
+    if problem.friction.schedule.state_size and not has_input(problem.friction.law, "heat"):
         # Its hidden state advances with samples, as in a controller: finer steps make another one.
         return torch.zeros_like(x)
     lower, upper = variables.bounds()

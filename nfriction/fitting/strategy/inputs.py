@@ -37,7 +37,7 @@ from nfriction.fitting.task import (
 )
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated, HeatedConstant
-from nfriction.friction.inputs import INPUTS, is_heated, reads_load, with_inputs
+from nfriction.friction.inputs import INPUTS, has_input, reads_load, with_inputs
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -111,14 +111,14 @@ def placed(task: FitTask, start: FitResult) -> FitTask:
 
     own, plants = start.model.law, [plant.replace() for plant in (task.plant, start.plant)]
     for plant in plants:
+        # For this linearisation only: a load with a column for each wave.
         plant.load = load  # type: ignore[method-assign]
     names = ["dry", *(f"{part} {k}" for part in ("cosine", "sine") for k in WAVES)]
     waves = [Coefficient(name, "N m", positive=False, prior_scale=1.0) for name in names]
     law = Law(f"{own.name}_by_waves", (*own.coefficients, *waves), _WavesTorque(own))
     choice = _Choice.of(_fitter(task, start, law, plants), task, start, {n: n for n in names})
     if choice is None:
-        one = torch.ones(task.plant.joints, dtype=torch.float64)
-        return at(rates[0] * one, 0.0 * one)
+        return at(rates[0] + 0.0 * task.plant.load_phase, 0.0 * task.plant.load_phase)
     dry, *rest = (torch.tensor(choice.columns[name]) for name in names)
     pairs = torch.stack(rest).reshape(2, len(WAVES), -1)
     choice = choice.with_noise_beside([*dry.tolist(), *pairs.flatten().tolist()])
@@ -184,9 +184,9 @@ def _fitter(
     known = dict(zip(at.model.law.names, values, strict=True))
     initial = torch.stack([known.get(name, 0.0 * values[0]) for name in law.names], -1)
     schedule = Constant(law, at.model.joints, initial)
-    if is_heated(law):
+    if has_input(law, "heat"):
         schedule = heated_schedule(law, initial, task.motions, cooling_time)
-        if is_heated(at.model.law):
+        if has_input(at.model.law, "heat"):
             seen = cast("Heated", at.model.schedule)
             schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
     model = FrictionModel(law, schedule, at.model.v_smooth)
@@ -321,11 +321,7 @@ class _Choice:
 
     @classmethod
     def of(
-        cls,
-        fitter: ShootingFitter,
-        task: FitTask,
-        start: FitResult,
-        coefficients: Mapping[str, str],
+        cls, fitter: ShootingFitter, task: FitTask, start: FitResult, names: Mapping[str, str]
     ) -> "_Choice | None":
         windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
         noise, model = effective_noise(start.residuals), fitter.friction
@@ -347,7 +343,7 @@ class _Choice:
         lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         place = model.law.names.index
-        columns = {name: rows[:, place(c)].tolist() for name, c in coefficients.items()}
+        columns = {name: rows[:, place(c)].tolist() for name, c in names.items()}
         bounds = lower.clamp(max=0.0), upper.clamp(min=0.0)
         whole = _of_shared(local, shared)
         errors = Quadratic(
@@ -357,10 +353,8 @@ class _Choice:
 
     def with_noise_beside(self, held: Sequence[int]) -> "_Choice":
         """The same with the noise that is unexplained by the columns `held`."""
-        ratio = self.evidence([])[1] / self.evidence(held)[1]
-        e = self.errors
-        errors = Quadratic(ratio * e.cost, ratio * e.gradient, ratio * e.hessian)
-        return replace(self, errors=errors)
+        k, e = self.evidence([])[1] / self.evidence(held)[1], self.errors
+        return replace(self, errors=Quadratic(k * e.cost, k * e.gradient, k * e.hessian))
 
     def best(self, held: Sequence[str], least: float) -> tuple[float, InputGain] | None:
         """The input that raises the log evidence most beside those held, and by how much.

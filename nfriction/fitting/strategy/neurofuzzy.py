@@ -47,7 +47,7 @@ from nfriction.fitting.task import (
 )
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated
-from nfriction.friction.inputs import is_heated
+from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
@@ -103,10 +103,10 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
-    if "F_p" in model.law.names and widened is not None:
+    if has_input(model.law, "position") and widened is not None:
         said.append(_ripple(found.plant))
     unmodelled = start.unmodelled
-    if is_heated(model.law):
+    if has_input(model.law, "heat"):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
         unmodelled = tuple(text for text in unmodelled if text not in task.drift)
     found = replace(found, status=" ".join([found.status, *said]))
@@ -259,7 +259,7 @@ def initialise_from_constant(
     schedule.set_range(*input_range(motions, schedule.along_motion, options))
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
     schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
-    if is_heated(model.law):
+    if has_input(model.law, "heat"):
         law = cast("Heated", constant.model.schedule)
         heat = law.heat_capacity, law.cooling_time, law.sample_time
         cast("Heated", schedule).set_heat(*heat)
