@@ -216,6 +216,7 @@ class Progress:
 
     def done(self) -> None:
         """End a stage."""
+        self._check()
         self._ended += 1
         self._last_end = time.monotonic()
         self._bar.update()
@@ -225,6 +226,11 @@ class Progress:
         self._check()
         self._steps += 1
         self._show(f"{self._what}, {stage}, step {self._steps}")
+
+    def resume(self) -> None:
+        """Go on after a Ctrl-C, with the fits that were finished by then."""
+        _interrupted.clear()
+        warn("interrupted: the finished fits are scored; another Ctrl-C ends the run.")
 
     def _show(self, what: str) -> None:
         now = time.monotonic()

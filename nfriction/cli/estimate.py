@@ -140,10 +140,11 @@ def compare_and_report(
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
-    """Fit, score, write and print; the status is 1 if a model could not be fitted."""
+    """Fit, score, write and print; the status is 1 if a model failed, 130 if interrupted."""
     from nfriction.cli.tables import verdict
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
+    from nfriction.evaluation.parallel import INTERRUPTED
     from nfriction.evaluation.results import exclusive, report_of, write_results
     from nfriction.report import write_report
 
@@ -171,7 +172,7 @@ def compare_and_report(
             write_report(arguments.out, page)  # replaces the page of an earlier run
         logger.info(verdict(comparison))
     _print(comparison, selection, plant, train, arguments)
-    return 1 if comparison.failed else 0
+    return 130 if INTERRUPTED in comparison.failed.values() else bool(comparison.failed)
 
 
 def _print(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import pandas as pd
 
-from nfriction.evaluation.parallel import Data, Progress, fit_models
+from nfriction.evaluation.parallel import Data, FitsInterrupted, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
 from nfriction.fitting.data.inputs import as_model, finer_counts, require_drive, warn_of_undriven
 from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
@@ -365,6 +365,8 @@ def compare(
         ImportError: if `jobs` needs joblib and it is not installed.
         ValueError, ArithmeticError, RuntimeError: if no model could be fitted; if only some could
             not, `failed` has the reasons.
+        KeyboardInterrupt: on a Ctrl-C before the first fit is finished; later, the models finished
+            by then are scored, and `failed` has the others.
     """
     models = [models] if isinstance(models, str) else models
     horizons = checked_lengths("horizons", horizons, 0)
@@ -385,9 +387,15 @@ def compare(
         for part in (train, test)
     )
     warned = _warned(_faster(plant, data, tested))
-    fits, failed = fit_models(
-        plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
-    )["fit"]
+    try:
+        fits, failed = fit_models(
+            plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
+        )["fit"]
+    except FitsInterrupted as interrupt:
+        fits, failed = interrupt.fits["fit"]
+        if not fits:
+            raise
+        progress.resume()
     warned += _warned(_mistakes(plant, next(iter(fits.values())), data, tested))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}

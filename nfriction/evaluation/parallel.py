@@ -37,6 +37,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 # Identifies this process; a task that finds another value runs elsewhere.
 _HERE = uuid.uuid4().hex
+INTERRUPTED = "interrupted"
 _PACKAGE = logging.getLogger("nfriction")
 
 
@@ -55,6 +56,9 @@ class Progress:
     def step(self, stage: str) -> None:
         """Count a step of a search that runs in this process."""
 
+    def resume(self) -> None:
+        """Go on after a Ctrl-C, with the fits that were finished by then."""
+
 
 class Data(NamedTuple):
     """Recordings, and their smoothed motions in joint coordinates."""
@@ -68,6 +72,14 @@ class Fits(NamedTuple):
 
     found: dict[str, FitResult]
     failed: dict[str, str]
+
+
+class FitsInterrupted(KeyboardInterrupt):
+    """A Ctrl-C while models were fitted, with the fits finished by then by part."""
+
+    def __init__(self, fits: dict[str, Fits]) -> None:
+        super().__init__()
+        self.fits = fits
 
 
 def fit_models(
@@ -86,6 +98,8 @@ def fit_models(
 
     Returns:
         Fits by part.
+    Raises:
+        FitsInterrupted: on a Ctrl-C.
     """
     check_jobs(jobs)
     if jobs != 1 and fit_settings.get("callback") is not None:
@@ -104,36 +118,46 @@ def fit_models(
     for part, (given, moved) in parts.items():
         joint = in_joint_coordinates(plant, given, plant.joints)
         turning[part] = turning_velocity(plant, joint, moved)
-    for level in dependency_levels(origin):
-        labels = {f"{part} {name}": (part, name) for part in parts for name in level}
-        tasks = {
-            # An instance, because another process may not know a user's law.
-            label: (
-                model_by_name(name)(plant.joints, v_smooth=turning[part]), plant, parts[part],
-                results[part].found.get(origin[name] or ""), fit_settings,
-            )
-            for label, (part, name) in labels.items()
-        }  # fmt: skip
-        for label, (result, seconds) in as_completed(_fit, tasks, jobs=jobs, progress=progress):
-            part, name = labels[label]
-            if isinstance(result, Exception):
-                errors.append(result)
-                results[part].failed[name] = str(result)
-                logger.warning("%s failed: %s", label, result)
-                continue
-            # A result from another process has copies of the motions.
-            found = replace(result, motions=tuple(parts[part].motions))
-            results[part].found[name] = found
-            logger.info("%s: %s (%.3g s)", label, result.status, seconds)
+    try:
+        for level in dependency_levels(origin):
+            labels = {f"{part} {name}": (part, name) for part in parts for name in level}
+            tasks = {
+                # An instance, because another process may not know a user's law.
+                label: (
+                    model_by_name(name)(plant.joints, v_smooth=turning[part]), plant, parts[part],
+                    results[part].found.get(origin[name] or ""), fit_settings,
+                )
+                for label, (part, name) in labels.items()
+            }  # fmt: skip
+            for label, (result, seconds) in as_completed(_fit, tasks, jobs=jobs, progress=progress):
+                part, name = labels[label]
+                if isinstance(result, Exception):
+                    errors.append(result)
+                    results[part].failed[name] = str(result)
+                    logger.warning("%s failed: %s", label, result)
+                    continue
+                # A result from another process has copies of the motions.
+                found = replace(result, motions=tuple(parts[part].motions))
+                results[part].found[name] = found
+                logger.info("%s: %s (%.3g s)", label, result.status, seconds)
+    except KeyboardInterrupt as interrupt:
+        for of in results.values():
+            left = (name for name in names if name not in of.found)
+            of.failed.update({name: of.failed.get(name, INTERRUPTED) for name in left})
+        raise FitsInterrupted(_in_order(results, names)) from interrupt
     if not any(of.found for of in results.values()):
         raise errors[0]
-    # Results arrived in the order in which they were finished.
+    return _in_order(results, names)
+
+
+def _in_order(results: dict[str, Fits], names: Sequence[str]) -> dict[str, Fits]:
+    """Fits in the requested order of models, instead of that in which they were finished."""
     return {
         part: Fits(
-            {name: of.found[name] for name in names if name in of.found},
-            {name: of.failed[name] for name in names if name in of.failed},
+            {name: found[name] for name in names if name in found},
+            {name: failed[name] for name in names if name in failed},
         )
-        for part, of in results.items()
+        for part, (found, failed) in results.items()
     }
 
 

@@ -1,5 +1,6 @@
 """Work in parallel processes: the same results, told here, errors with a name, a clean end."""
 
+import json
 import logging
 import os
 import signal
@@ -13,6 +14,7 @@ import pytest
 import torch
 
 from nfriction.evaluation import parallel
+from nfriction.evaluation.compare import compare
 from tests.cli.benches import pendulum, swing
 
 logger = logging.getLogger("nfriction.tests")
@@ -103,6 +105,37 @@ def test_what_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         parallel.check_jobs(2)
 
 
+class Interrupted(parallel.Progress):
+    """A user who presses Ctrl-C at the end of a stage."""
+
+    def __init__(self, stages: int) -> None:
+        self.left, self.resumed = stages, 0
+
+    def done(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+    def resume(self) -> None:
+        self.resumed += 1
+
+
+def test_finished_fits_survive_ctrl_c() -> None:
+    settings = {"max_steps": 3, "windows": (0.5,), "fit_plant": False}
+    user = Interrupted(2)
+    found = compare(pendulum(), ["NCFM", "CVFM"], [swing("a", 1.5)], [swing("b", 1.2)],
+                    progress=user, **settings)  # fmt: skip
+    assert user.resumed == 1
+    assert [*found.fits] == ["NCFM"]
+    assert dict(found.failed) == {"CVFM": "interrupted"}
+    assert [*found.test] == ["no friction", "NCFM"]
+    with pytest.raises(KeyboardInterrupt):
+        compare(pendulum(), ["NCFM"], [swing("a", 1.5)], progress=Interrupted(1), **settings)
+    # While results are scored, nothing is left to be saved.
+    with pytest.raises(KeyboardInterrupt):
+        compare(pendulum(), ["NCFM"], [swing("a", 1.5)], progress=Interrupted(2), **settings)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to a group of processes")
 def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
@@ -127,8 +160,11 @@ def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
     os.killpg(process.pid, signal.SIGINT)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert said.startswith("nfriction: interrupted (fit NLFM | fit Stribeck)")
-    assert said.count("\n") == 1
+    assert said.startswith("nfriction: warning: interrupted: the finished fits are scored")
+    # The model that was finished is not lost.
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [*results["models"]] == ["no friction", "NCFM"]
+    assert results["failed"] == {"NLFM": "interrupted", "Stribeck": "interrupted"}
     # Nobody of the session is left to be told anything.
     for _ in range(50):
         try:
@@ -138,4 +174,4 @@ def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
         time.sleep(0.1)
     else:
         pytest.fail("a worker is still there")
-    assert not list((tmp_path / "out").iterdir())
+    assert {path.stem for path in (tmp_path / "out" / "models").iterdir()} == {"NCFM"}
