@@ -18,6 +18,7 @@ from nfriction.fitting.strategy.holdout import (
     holdout_splits,
     holdout_squares,
     holdout_windows,
+    recording_splits,
 )
 from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -72,6 +73,19 @@ def test_every_window_is_held_out_once(constant):
             held_back += judged.spans
         samples = [np.arange(first, last) for _, first, last in sorted(held_back)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_every_recording_is_held_out_once(constant, count):
+    joint, found = constant
+    windows = holdout_windows([joint] * count, [*found.motions] * count, 0.5, FOLDS)
+    held_out = []
+    for seen, judged in recording_splits(windows, FOLDS):
+        places = [{place for place, *_ in part.spans} for part in (seen, judged)]
+        assert set.union(*places) == set(range(count))
+        assert not set.intersection(*places)
+        held_out += places[1]
+    assert sorted(held_out) == list(range(count))
 
 
 def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):

@@ -1,4 +1,4 @@
-"""Hold-out validation: training on some windows and testing on the others, each in turn."""
+"""Hold-out validation: training on some windows or recordings and testing on the others."""
 
 import math
 from collections.abc import Sequence
@@ -58,14 +58,26 @@ def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]
     return [(windows.subset(fold != k), windows.subset(fold == k)) for k in reversed(range(folds))]
 
 
-def verdict(network: Tensor, law: Tensor) -> str:
-    """Sentence that rejects a network, from squared errors on each window, (window,)."""
+def recording_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]]:
+    """Training and test windows of different recordings, in at most `folds` groups."""
+    place = torch.tensor([place for place, *_ in windows.spans])
+    place = place.unique(return_inverse=True)[1]  # some recordings may have no window
+    count = int(place.max()) + 1
+    group = place * min(folds, count) // count
+    return [(windows.subset(group != k), windows.subset(group == k)) for k in group.unique()]
+
+
+def verdict(network: Tensor, law: Tensor, blocks: str = "windows") -> str:
+    """Sentence that rejects a network, from squared errors on each window, (window,).
+
+    `blocks` are what was held out.
+    """
     ratio, spread = log_ratio(network, law)
     if math.isinf(ratio):
-        return "Network rejected: it diverges on hold-out windows; its constant law is kept."
+        return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
     change = 100 * math.expm1(ratio)
     return (
-        f"Network rejected: on hold-out windows it was {abs(change):.3g} % "
+        f"Network rejected: on hold-out {blocks} it was {abs(change):.3g} % "
         f"{'worse' if change > 0 else 'better'} than its constant law, with a standard error of "
         f"{100 * spread:.2g} %; the constant law is kept."
     )

@@ -2,7 +2,7 @@
 
 A candidate is a term of the law with its own coefficient (`friction.inputs`). Its evidence is
 that of the Gauss-Newton model at the fitted law; one linearisation includes every candidate.
-The choice among the candidates is then made on hold-out windows.
+The choice among the candidates is then made on hold-out windows and recordings.
 """
 
 import copy
@@ -74,7 +74,8 @@ def candidates(task: FitTask) -> tuple[str, ...]:
     known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
     # The papers' network may have a hidden state of its own.
     heated = "network" not in task.model.options()
-    possible = {"direction": True, "load": free and known, "position": free, "heat": heated}
+    placed = free and bool(_covered(task).any(0).all())
+    possible = {"direction": True, "load": free and known, "position": placed, "heat": heated}
     return tuple(name for name in INPUTS if possible[name])
 
 
@@ -92,15 +93,28 @@ class _WavesTorque:
         return tau_f + (waves * load).sum(-1) * torch.tanh(qd / v_smooth)
 
 
+def _wave_rates(task: FitTask) -> Tensor:
+    """Phase of each wave per position [1; rad/m], (wave,); waves of an axis fit into its stroke."""
+    stroke = float(np.ptp(np.concatenate([m.q for m in task.motions])))
+    turn = 2 * math.pi if task.plant.unit == "rad" else stroke
+    return 2 * math.pi / turn * torch.tensor(WAVES, dtype=torch.float64)
+
+
+def _covered(task: FitTask) -> Tensor:
+    """Whether the motion covers half a period of each wave, (wave, joint).
+
+    Otherwise its largest and smallest friction would be extrapolated.
+    """
+    visited = torch.as_tensor(np.ptp(np.concatenate([m.q for m in task.motions]), axis=0))
+    return torch.outer(_wave_rates(task), visited) >= math.pi
+
+
 def placed(task: FitTask, start: FitResult) -> FitTask:
     """The task with the plant's load (1 + cos(k q + p)) / 2, for k and p favoured by the evidence.
 
     All waves and joints are fitted at once; then each joint keeps the wave that it needs most.
     """
-    # Waves of an axis fit into its stroke.
-    stroke = float(np.ptp(np.concatenate([m.q for m in task.motions])))
-    turn = 2 * math.pi if task.plant.unit == "rad" else stroke
-    rates = 2 * math.pi / turn * torch.tensor(WAVES, dtype=torch.float64)
+    rates, covered = _wave_rates(task), _covered(task)
 
     def load(q: Tensor, qd: Tensor) -> Tensor:
         angle = rates * q[..., None]
@@ -127,7 +141,10 @@ def placed(task: FitTask, start: FitResult) -> FitTask:
         others = [p[:, best[i]] if i < j else p.flatten() for i, p in enumerate(pairs.unbind(-1))]
         others[j] = dry
         tried = [torch.cat([*others, pair]).tolist() for pair in pairs[..., j].unbind(-1)]
-        best.append(int(np.argmax([choice.evidence(columns)[0] for columns in tried])))
+        evidence = [choice.evidence(columns)[0] for columns in tried]
+        # The shortest wave, if the joint moves too little for any.
+        covering = covered[:, j].nonzero().flatten().tolist() or [len(WAVES) - 1]
+        best.append(max(covering, key=evidence.__getitem__))
     chosen = pairs[:, best, range(len(best))]
     cosine, sine = choice.evidence([*dry.tolist(), *chosen.flatten().tolist()])[2][chosen]
     return at(rates[best], torch.atan2(-sine, cosine))

@@ -5,6 +5,7 @@ inputs (`inputs`) are kept if law and network improve on hold-out windows. Train
 the residual noise, with the prior of each group of parameters set by evidence, and moves the sets
 if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
 windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
+With several recordings, inputs and the final network must also gain on hold-out recordings.
 """
 
 import copy
@@ -131,7 +132,10 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
     rival = _Contest(replace(seeing, model=model), start)
-    if not gains(rival.validation.of_law, plain.validation.of_law):
+    new, old = rival.validation, plain.validation
+    if not gains(new.of_law, old.of_law):
+        return (), plain
+    if new.several and not gains(new.of_law_apart, old.of_law_apart):
         return (), plain
     rival.train()
     if not gains(rival.squares, plain.squares):
@@ -204,8 +208,9 @@ class _Contest:
                 before, best = best, validation.trained_on(best)
             end = best.end
             if self.accepts(best) and not end.stopped:
-                end = validation.fit_all(best)
-                note = validation.lost_by(end)
+                note = validation.lost_apart(best)
+                end = end if note else validation.fit_all(best)
+                note = note or validation.lost_by(end)
         except holdout.StoppedError:
             end = best.end.as_stopped()
         if not self.accepts(best):
@@ -385,8 +390,23 @@ class Validation:
     @cached_property
     def of_law(self) -> Tensor:
         """Squared errors of the law on each hold-out window, (window,)."""
+        return self.judged(self.law_trial).squares
+
+    @cached_property
+    def of_law_apart(self) -> Tensor:
+        """Squared errors of the law on each window of hold-out recordings, (window,)."""
+        return self.apart(self.law_trial)
+
+    @cached_property
+    def law_trial(self) -> Trial:
+        """The law, fitted to the windows of the first split."""
         values = self.law.friction.schedule.parameter_vector()
-        return self.judged(self.trial(self.law, values, "constant law, hold-out")).squares
+        return self.trial(self.law, values, "constant law, hold-out")
+
+    @property
+    def several(self) -> bool:
+        """True if whole recordings can be held out."""
+        return len({place for place, *_ in self.windows.spans}) > 1
 
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The trial with the best prior; a wider plant prior is used only if clearly better."""
@@ -426,7 +446,7 @@ class Validation:
         moved = self._adapted(held, noise, stride, learn_sets=True)
         gained = log_evidence(moved.end) - log_evidence(held.end)
         better = moved if gained > self.options.evidence_gain else held
-        judged = self.judged(replace(better, squares=self._errors(better.end)))
+        judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
         if gains(judged.squares, trial.squares):
             return judged
         return judged if explained and not gains(trial.squares, judged.squares) else trial
@@ -465,6 +485,16 @@ class Validation:
         """The network of a trial, fitted to all windows."""
         return self._further(trial, self.windows, f"{self.length:g} s windows")
 
+    def lost_apart(self, trial: Trial) -> str:
+        """Reason to reject a network that gains too little on hold-out recordings, or "".
+
+        Windows between those of training show the same motion, and hide that a network follows what
+        is particular to a recording.
+        """
+        if not self.several or gains(apart := self.apart(trial), self.of_law_apart):
+            return ""
+        return holdout.verdict(apart, self.of_law_apart, "recordings")
+
     def lost_by(self, end: HorizonResult) -> str:
         """Reason to reject a network that is worse than its law over the law's windows, or "".
 
@@ -490,22 +520,28 @@ class Validation:
         """A search on the first split."""
         problem = fitter.problem(self.splits[0][0], self.noise, friction, stride=self.stride)
         end = fitter.search(problem, problem.variables.start(self.plant), self.tolerance, name)
-        return Trial(self._errors(end), fitter, end, self.tolerance)
+        return Trial(self._errors(end, self.splits[0][1]), fitter, end, self.tolerance)
 
     def judged(self, trial: Trial) -> Trial:
         """A trial with its error on every window, from searches on the other windows."""
         found = [trial.squares]
-        for place, (train, _) in enumerate(self.splits[1:], 1):
+        for train, test in self.splits[1:]:
             end = self._further(trial, train, "other windows, hold-out")
-            found.append(self._errors(end, place))
+            found.append(self._errors(end, test))
         return replace(trial, squares=torch.cat(found))
 
-    def _errors(self, end: HorizonResult, place: int = 0) -> Tensor:
-        """Squared errors of a search on the windows that a split holds out, (window,)."""
+    def apart(self, trial: Trial) -> Tensor:
+        """Squared errors of a trial on every window, from searches on other recordings."""
+        splits = holdout.recording_splits(self.windows, self.options.folds)
+        ends = (self._further(trial, train, "other recordings, hold-out") for train, _ in splits)
+        return torch.cat([self._errors(e, test) for e, (_, test) in zip(ends, splits, strict=True)])
+
+    def _errors(self, end: HorizonResult, test: Windows) -> Tensor:
+        """Squared errors of a search on hold-out windows, (window,)."""
         if end.stopped:
             raise holdout.StoppedError
         friction, plant, *_ = end.parts
-        squares = holdout.holdout_squares(self.splits[place][1], end.problem, friction, plant)
+        squares = holdout.holdout_squares(test, end.problem, friction, plant)
         return squares.clamp_min(self.explained**2)
 
 
