@@ -148,6 +148,7 @@ def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
     assert gains(network, law) is gained
     # The less chance is left to scatter, the larger has a gain to be.
     assert gains(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
+    assert gains(network, law, least=1.1) is (gained and max(ratios) < 1 / 1.1)
     # A law that diverges loses to what does not.
     assert gains(law, torch.where(law > 3, torch.inf, law))
 

@@ -8,15 +8,19 @@ from torch import Tensor
 from nfriction.fitting.options import DEFAULTS
 
 
-def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance) -> bool:
+def gains(
+    new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance, least: float = 1.0
+) -> bool:
     """True if squared errors on windows (window,) fell by more than their scatter would by chance.
 
-    Uses Student's distribution, because there may be few windows.
+    Uses Student's distribution, because there may be few windows. The ratio of the old to the new
+    root mean square must be above `least`.
     """
     if not old.isfinite().all():
         return bool(new.isfinite().all())
     ratio, spread = log_ratio(new, old)
-    return ratio + spread * student_quantile(len(new) - 1, 1 - chance) < 0
+    by_chance = spread * student_quantile(len(new) - 1, 1 - chance)
+    return ratio + max(by_chance, math.log(least)) < 0
 
 
 def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:

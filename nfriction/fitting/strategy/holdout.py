@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows, moving_segments
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
@@ -70,16 +71,18 @@ def recording_splits(windows: Windows, folds: int) -> list[tuple[Windows, Window
 def verdict(network: Tensor, law: Tensor, blocks: str = "windows") -> str:
     """Sentence that rejects a network, from squared errors on each window, (window,).
 
-    `blocks` are what was held out.
+    `blocks` names the kind of data that was held out.
     """
     ratio, spread = log_ratio(network, law)
     if math.isinf(ratio):
         return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
     change = 100 * math.expm1(ratio)
+    least = 100 * (DEFAULTS.explained_ratio - 1)
+    required = "" if change > 0 else f" ({least:.0f} % and more than the scatter are required)"
     return (
         f"Network rejected: on hold-out {blocks} it was {abs(change):.3g} % "
         f"{'worse' if change > 0 else 'better'} than its constant law, with a standard error of "
-        f"{100 * spread:.2g} %; the constant law is kept."
+        f"{100 * spread:.2g} %{required}; the constant law is kept."
     )
 
 

@@ -5,7 +5,7 @@ inputs (`inputs`) are kept if law and network improve on hold-out windows. Train
 the residual noise, with the prior of each group of parameters set by evidence, and moves the sets
 if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
 windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
-With several recordings, inputs and the final network must also gain on hold-out recordings.
+With several recordings, neither inputs nor the final network may be worse on hold-out recordings.
 """
 
 import copy
@@ -133,9 +133,9 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     cast("NeuroFuzzyModel", model).see(names)
     rival = _Contest(replace(seeing, model=model), start)
     new, old = rival.validation, plain.validation
-    if not gains(new.of_law, old.of_law):
+    if not gains(new.of_law, old.of_law, least=task.options.explained_ratio):
         return (), plain
-    if new.several and not gains(new.of_law_apart, old.of_law_apart):
+    if new.several and gains(old.of_law_apart, new.of_law_apart):
         return (), plain
     rival.train()
     if not gains(rival.squares, plain.squares):
@@ -175,7 +175,9 @@ class _Contest:
 
     def accepts(self, trial: "Trial") -> bool:
         """True if the network beats the law on hold-out windows."""
-        return gains(trial.squares, self.validation.of_law)
+        # Noise explains errors up to this multiple of it, so a smaller gain may be noise.
+        least = self.task.options.explained_ratio
+        return gains(trial.squares, self.validation.of_law, least=least)
 
     @property
     def squares(self) -> Tensor:
@@ -486,12 +488,12 @@ class Validation:
         return self._further(trial, self.windows, f"{self.length:g} s windows")
 
     def lost_apart(self, trial: Trial) -> str:
-        """Reason to reject a network that gains too little on hold-out recordings, or "".
+        """Reason to reject a network that is worse than its law on hold-out recordings, or "".
 
         Windows between those of training show the same motion, and hide that a network follows what
-        is particular to a recording.
+        is particular to a recording. A gain is not required, because there is less to train on.
         """
-        if not self.several or gains(apart := self.apart(trial), self.of_law_apart):
+        if not self.several or not gains(self.of_law_apart, apart := self.apart(trial)):
             return ""
         return holdout.verdict(apart, self.of_law_apart, "recordings")
 
