@@ -115,7 +115,7 @@ def mistakes() -> Iterator[Mistake]:
 
 
 def answer(of: Mistake, law: str, seed: int) -> tuple[str, str]:
-    """Whether a fit names a mistake, calls its result unusable or says nothing; and its words."""
+    """The verdict on a fit to data with a mistake, and the words of the fit."""
     drive = {} if of.free else ROTORS
     plant: Plant = PendulumChain(**LINKS, **drive)
     truth = BEARINGS if of.free else FRICTION
