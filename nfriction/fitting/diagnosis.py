@@ -35,6 +35,10 @@ FEWEST_BLOCKS = 20
 SPEED_KNOTS = 5
 
 
+# Other units of inertia than kg m^2, as CAD programs and data sheets give them.
+UNITS_OF_INERTIA = {"g m^2": 1e-3, "kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
+
+
 @dataclass(frozen=True)
 class Mistake:
     """A mistake that would explain why no friction fits.
@@ -338,10 +342,14 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
     data = plant.to_dict()
     if "buffers" in data:
         return  # they would override the corrected arguments
+    milli = {"length": 1e-3, "com": 1e-3}
     mistakes: dict[str, dict[str, float]] = {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
-        "lengths are in mm": {"length": 1e-3, "com": 1e-3},
+        "lengths are in mm": milli,
+        "lengths are in mm, and inertias in kg mm^2": {**milli, "inertia": 1e-6},
+        "the rig is in g, mm and g mm^2": {**milli, "mass": 1e-3, "inertia": 1e-9},
+        **{f"inertias are in {unit}": {"inertia": f} for unit, f in UNITS_OF_INERTIA.items()},
     }
     changes = {
         text: {k: np.array(data[k]) * f for k, f in factors.items() if data.get(k) is not None}
