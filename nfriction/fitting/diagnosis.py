@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +24,8 @@ from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
-from nfriction.signals import Motion
+from nfriction.recording.validation import MINIMUM_SAMPLES
+from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
 
@@ -31,6 +33,8 @@ Array = NDArray[np.float64]
 FEWEST_FOR_CURVATURE = 5
 # With fewer blocks, one of the corrections would explain most of the torque by chance.
 FEWEST_BLOCKS = 20
+# Steps that are alike differ by less than this part; noise and counts must be smaller, too.
+ALIKE = 0.1
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -110,6 +114,9 @@ def likely_mistakes(
         not distinguish them, none if no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
+    # Wrong times spoil the balance, and a fit absorbs some of them in the inertia.
+    if lost := [*_lost_rows(recordings, options)]:
+        return math.nan, (lost[0],)
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
@@ -130,6 +137,9 @@ def likely_mistakes(
     if len(recordings) > 1 and not zeroed:
         most = sound / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
+    # Near one position, a spring is like gravity, which is a simpler cause.
+    least = min((share for _, share in tested), default=math.inf)
+    tested += [x for x in _springs(plant, given) if options.diagnosis_tie * x[1] < least]
     found = [
         Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
     ]
@@ -151,6 +161,41 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     )
     known = not math.isnan(mistakes[0].unexplained)
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
+
+
+def _lost_rows(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
+    """Recordings with rows that are missing or repeated while the time goes on evenly.
+
+    Between two steps before and two after it that are all alike, a step of twice their length lacks
+    a row, and one of zero repeats a row: no joint moves so.
+    """
+    for recording in recordings:
+        if len(recording) < 6:
+            continue
+        q, time = (sliding_window_view(x, 6, axis=0) for x in (recording.q, recording.time))
+        steps = np.diff(q)
+        mean = np.delete(steps, 2, -1).mean(-1)
+        apart, size = np.ptp(np.delete(steps, 2, -1), axis=-1), np.abs(mean)
+        noise = np.median(np.abs(np.diff(recording.q, n=2, axis=0)), axis=0)
+        seen = size * ALIKE > np.fmax(noise, count_seen(recording.q))
+        even = np.ptp(np.diff(time), axis=-1) < ALIKE * recording.sample_time
+        seen &= (apart < ALIKE * size) & even[:, None]
+        for factor, rows, remedy in (
+            (2, "missing", "use the logger's own time stamps"),
+            (0, "repeated", "drop repeated rows before rows are given their times"),
+        ):
+            # A row is lost for all joints. Noise causes half of this error more often.
+            found, half = (
+                int((seen.any(1) & ((np.abs(error) < ALIKE * size) | ~seen).all(1)).sum())
+                for error in (steps[..., 2] - x * mean for x in (factor, (1 + factor) / 2))
+            )
+            share = found / max(1, int(seen.any(1).sum()))
+            if found >= max(MINIMUM_SAMPLES, half) and share > options.clock_error[0]:
+                text = (
+                    f"about {100 * share:.2g} % of the rows of {recording.name or 'a recording'} "
+                    f"are {rows}, although `time` goes on evenly ({remedy})"
+                )
+                yield Mistake(text, math.nan)
 
 
 def _driven_without_torque(
@@ -338,13 +383,25 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
     data = plant.to_dict()
     if "buffers" in data:
         return  # they would override the corrected arguments
+    motor = data.get("motor") or {}
+    given = data | motor
     mistakes: dict[str, dict[str, float]] = {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
         "lengths are in mm": {"length": 1e-3, "com": 1e-3},
-    }
+        "masses are in g, lengths in mm, and inertias in g mm^2": {
+            "mass": 1e-3, "length": 1e-3, "com": 1e-3, "inertia": 1e-9,
+        },
+    }  # fmt: skip
+    rotor = "rotor_inertia" if motor else "armature"
+    for what, keys in (
+        ("inertias are", ("inertia",)), (f"each `{rotor}` is", (rotor,)),
+        (f"inertias and each `{rotor}` are", ("inertia", rotor)),
+    ):  # fmt: skip
+        for unit, factor in (("kg cm^2", 1e-4), ("g cm^2", 1e-7)):
+            mistakes[f"{what} in {unit}"] = dict.fromkeys(keys, factor)
     changes = {
-        text: {k: np.array(data[k]) * f for k, f in factors.items() if data.get(k) is not None}
+        text: {k: np.array(given[k]) * f for k, f in factors.items() if given.get(k) is not None}
         for text, factors in mistakes.items()
     }
     inertia = np.array(data.get("inertia") or ())
@@ -352,8 +409,10 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
         central = inertia - np.array(data["mass"]) * np.array(data["com"]) ** 2
         changes["inertias are about the joints, not about the mass centres"] = {"inertia": central}
     for text, change in changes.items():
-        if change and change.keys() <= data.keys():
+        if change and change.keys() <= given.keys():
             parts = {key: values.tolist() for key, values in change.items()}
+            if motor:
+                parts["motor"] = motor | {k: parts.pop(k) for k in motor if k in parts}
             # Some would be no mechanism, or a strange one.
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -603,6 +662,22 @@ def _growth(
     found = torch.linalg.lstsq(terms[seen], torque[seen], driver="gelsd").solution
     missed = [torque - known @ constant, torque - terms @ found]
     return float(found[-1]), torch.stack([x[left_out].square().sum() for x in missed])
+
+
+def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
+    """Each joint with a spring to the frame, in proportion to its position."""
+    needed = given.needed(plant)
+    for j, name in enumerate(plant.joint_names):
+        # Where the spring is at rest is unknown.
+        extra = torch.zeros(*given.q.shape, 2).to(given.q)
+        extra[:, j] = torch.stack([given.q[:, j], torch.ones_like(given.q[:, j])], -1)
+        stiffness = -_balance(given, given.tau - needed, extra)[1]
+        kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
+        text = (
+            f"{name} has a spring of {stiffness:.3g} {unit}, which the rig lacks (subtract this "
+            f"times the position from the {kind} of {name})"
+        )
+        yield text, _unexplained(plant, given, extra)
 
 
 def balanced_delay(
