@@ -24,7 +24,7 @@ from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
-from nfriction.recording.validation import MINIMUM_SAMPLES
+from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, turns_between_samples
 from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
@@ -114,9 +114,9 @@ def likely_mistakes(
         not distinguish them, none if no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
-    # Wrong times spoil the balance, and a fit absorbs some of them in the inertia.
-    if lost := [*_lost_rows(recordings, options)]:
-        return math.nan, (lost[0],)
+    # These spoil the balance, and a fit absorbs some wrong times in the inertia.
+    if broken := [*_broken(recordings, options)]:
+        return math.nan, (broken[0],)
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
@@ -163,15 +163,18 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
 
 
-def _lost_rows(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
-    """Recordings with rows that are missing or repeated while the time goes on evenly.
+def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
+    """Recordings of wrapped angles, and those that lack or repeat rows under even times.
 
     Between two steps before and two after it that are all alike, a step of twice their length lacks
     a row, and one of zero repeats a row: no joint moves so.
     """
     for recording in recordings:
-        if len(recording) < 6:
-            continue
+        name = recording.name or "a recording"
+        wrapped = turns_between_samples(recording.q, gaps(recording.time)).any()
+        if wrapped and recording.unit == "rad":
+            text = f"positions of {name} are wrapped (unwrap them, as `numpy.unwrap(q, axis=0)`)"
+            yield Mistake(text, math.nan)
         q, time = (sliding_window_view(x, 6, axis=0) for x in (recording.q, recording.time))
         steps = np.diff(q)
         mean = np.delete(steps, 2, -1).mean(-1)
@@ -191,11 +194,8 @@ def _lost_rows(recordings: Sequence[Recording], options: FitOptions) -> Iterator
             )
             share = found / max(1, int(seen.any(1).sum()))
             if found >= max(MINIMUM_SAMPLES, half) and share > options.clock_error[0]:
-                text = (
-                    f"about {100 * share:.2g} % of the rows of {recording.name or 'a recording'} "
-                    f"are {rows}, although `time` goes on evenly ({remedy})"
-                )
-                yield Mistake(text, math.nan)
+                of = f"about {100 * share:.2g} % of the rows of {name} are {rows}"
+                yield Mistake(f"{of}, although `time` goes on evenly ({remedy})", math.nan)
 
 
 def _driven_without_torque(

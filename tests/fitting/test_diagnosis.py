@@ -351,6 +351,13 @@ def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
     assert f"% of the rows of a recording are {named}, although" in found[0]
 
 
+def test_wrapped_angles_are_no_elastic_joint():
+    plant, q, tau = measured("wheel")
+    with pytest.warns(UserWarning, match="looks wrapped"):
+        first = warnings_of(plant, 20 * q % (2 * math.pi), tau)[0]
+    assert "likely: positions of a recording are wrapped (unwrap them" in first
+
+
 def test_an_inertia_that_the_fit_corrects_is_no_mistake():
     plant, q, tau = measured("wheel")
     less = 0.93 * plant.inertia_coupling
