@@ -665,19 +665,18 @@ def _growth(
 
 
 def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
-    """Each joint with a spring to the frame, in proportion to its position."""
+    """Each driven joint with a spring to the frame, whose rest is anywhere."""
     needed = given.needed(plant)
-    for j, name in enumerate(plant.joint_names):
-        # Where the spring is at rest is unknown.
-        extra = torch.zeros(*given.q.shape, 2).to(given.q)
-        extra[:, j] = torch.stack([given.q[:, j], torch.ones_like(given.q[:, j])], -1)
-        stiffness = -_balance(given, given.tau - needed, extra)[1]
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+        part = torch.zeros_like(given.tau)
+        part[:, j] = given.q[:, j]
+        stiffness = -_balance(given, given.tau - needed, part)[1]
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (
-            f"{name} has a spring of {stiffness:.3g} {unit}, which the rig lacks (subtract this "
-            f"times the position from the {kind} of {name})"
+            f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit}, which the rig lacks "
+            f"(subtract this times the position from the {kind} of {plant.joint_names[j]})"
         )
-        yield text, _unexplained(plant, given, extra)
+        yield text, _unexplained(plant, given, part)
 
 
 def balanced_delay(
