@@ -39,6 +39,10 @@ ALIKE = 0.1
 SPEED_KNOTS = 5
 
 
+# Other units of inertia than kg m^2, as CAD programs and data sheets give them.
+UNITS_OF_INERTIA = {"g m^2": 1e-3, "kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
+
+
 @dataclass(frozen=True)
 class Mistake:
     """A mistake that would explain why no friction fits.
@@ -385,21 +389,18 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
         return  # they would override the corrected arguments
     motor = data.get("motor") or {}
     given = data | motor
+    rotor, milli = "rotor_inertia" if motor else "armature", {"length": 1e-3, "com": 1e-3}
     mistakes: dict[str, dict[str, float]] = {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
-        "lengths are in mm": {"length": 1e-3, "com": 1e-3},
-        "masses are in g, lengths in mm, and inertias in g mm^2": {
-            "mass": 1e-3, "length": 1e-3, "com": 1e-3, "inertia": 1e-9,
-        },
-    }  # fmt: skip
-    rotor = "rotor_inertia" if motor else "armature"
-    for what, keys in (
-        ("inertias are", ("inertia",)), (f"each `{rotor}` is", (rotor,)),
-        (f"inertias and each `{rotor}` are", ("inertia", rotor)),
-    ):  # fmt: skip
-        for unit, factor in (("kg cm^2", 1e-4), ("g cm^2", 1e-7)):
-            mistakes[f"{what} in {unit}"] = dict.fromkeys(keys, factor)
+        "lengths are in mm": milli,
+        "lengths are in mm, and inertias in kg mm^2": {**milli, "inertia": 1e-6},
+        "the rig is in g, mm and g mm^2": {**milli, "mass": 1e-3, "inertia": 1e-9},
+    }
+    for unit, factor in UNITS_OF_INERTIA.items():
+        mistakes[f"inertias are in {unit}"] = {"inertia": factor}
+        mistakes[f"each `{rotor}` is in {unit}"] = {rotor: factor}
+        mistakes[f"inertias and each `{rotor}` are in {unit}"] = {"inertia": factor, rotor: factor}
     changes = {
         text: {k: np.array(given[k]) * f for k, f in factors.items() if given.get(k) is not None}
         for text, factors in mistakes.items()

@@ -307,6 +307,8 @@ def test_mistakes_in_torques(name, change, finding):
         ("motor", {"armature": None}, "rotor inertia of 0.05"),
         ("motor", {"inertia": [0.0075 + 0.15**2]}, "inertias are about the joints"),
         ("motor", {"mass": [1e3], "inertia": [7.5]}, "masses are in g"),
+        ("free", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
+        ("motor", {"length": [300.0], "com": [150.0], "inertia": [7.5e3]}, "in kg mm^2"),
         ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
@@ -320,7 +322,7 @@ def test_mistakes_in_torques(name, change, finding):
                 "com": [150, 120],
                 "inertia": [3.75e6, 1.56e6],
             },
-            "masses are in g, lengths in mm, and inertias in g mm^2",
+            "the rig is in g, mm and g mm^2",
         ),
     ],
 )
@@ -404,6 +406,18 @@ def test_a_driven_motion_without_torque_is_named(name):
     plant, q, _ = measured(name)
     (found, *_) = warnings_of(plant, q, None)
     assert "has no torque, but its motion gains energy up to" in found
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_swing_that_gains_little_energy_is_named(backwards):
+    """The balance of torques is too coarse for weak friction; a fit is not."""
+    swung = swing(pendulum(), CVFM(2, [[1e-3, 2e-4], [4e-4, 1e-4]]).requires_grad_(False))
+    q = np.pi / 1024 * np.round(swung.q * 1024 / np.pi)
+    recording = Recording(swung.time, q[::-1] if backwards else q, convention=swung.convention)
+    found = fit(CVFM(2), pendulum(), recording, windows=(0.5, 2.0), max_steps=20)
+    named = [text for text in found.mistakes if "time runs backwards" in text]
+    assert bool(named) == backwards
+    assert (found.usability[0] == "do not use") == backwards
 
 
 def test_a_drive_that_saturates_is_named():

@@ -108,9 +108,11 @@ def result_from_shooting(
     residual = float(counted.square().mean().sqrt())
     outliers = tuple(outliers_of(problem, weights))
     noise = uncertainty.measurement_noise(problem, x, residual)
+    limit = problem.options.model_error_ratio
     intervals, unidentifiable, root = _identifiability(
         problem, result, names, residuals * weights, motions, ambiguous
     )
+    mistakes = lossless_motion(problem, at_zero) if residual > limit * noise else ()
     return FitResult(
         model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
@@ -126,7 +128,9 @@ def result_from_shooting(
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
-        warnings=identifiability.warnings_of(
+        mistakes=mistakes,
+        warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)
+        + identifiability.warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero,
         )
@@ -140,6 +144,19 @@ def result_from_shooting(
         outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
+
+
+def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[str, ...]:
+    """A clause if friction and drag of a free motion are all at zero."""
+    law, plant = problem.friction.law.coefficients, problem.jacobian.plant
+    losses = [f"{c.name} of {j}" for c in law if c.unit.startswith("N") for j in plant.joint_names]
+    losses += [term.name for term in problem.variables.terms if term.to_none]
+    if problem.windows.tau.any() or not set(losses) <= set(at_zero):
+        return ()
+    return (
+        "a free motion fits best without any loss of energy: time runs backwards, or the torque of "
+        "a drive is missing",
+    )
 
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:

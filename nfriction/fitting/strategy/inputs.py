@@ -101,7 +101,7 @@ def _wave_rates(task: FitTask) -> Tensor:
 
 
 def _covered(task: FitTask) -> Tensor:
-    """Whether the motion covers half a period of each wave, (wave, joint).
+    """True where the motion covers half a period of a wave, (wave, joint).
 
     Otherwise its largest and smallest friction would be extrapolated.
     """
