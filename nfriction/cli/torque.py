@@ -80,6 +80,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
     for name, why in found.failed.items():
         warn(f"{plain_name(name)} was not fitted: {one_line(why)}")
+    for remark in found.table.remarks[len(table.remarks) :]:
+        warn(one_line(remark))
     print(f"{error_table(found)}\n\n{choice_table(found)}\n")
     print(_printed(found.intervals()))
     print(f"\nwrote {written[-2]}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import html
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,7 +27,13 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
 from nfriction.recording import Unit
-from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table, blocks
+from nfriction.recording.torque_table import (
+    MINIMUM_ROWS,
+    JointTorque,
+    TorqueTable,
+    as_table,
+    blocks,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +49,11 @@ LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
 WITH_TIME = ("slip", "neuro-fuzzy:slip")
 WITH_LOAD = ("load-coulomb",)
 WITH_BOTH = ("load-slip",)
+# Distance of the outer fences from the quartiles, in their distances from each other (J. W. Tukey,
+# Exploratory Data Analysis, 1977): of 400,000 Gaussian errors one is beyond.
+FENCE = 3.0
+# Errors below this part of the median torque do not matter.
+SMALL = 0.01
 
 
 class TorqueScore(NamedTuple):
@@ -317,10 +328,46 @@ def fit_torque(
     if not fits:
         raise ValueError(" ".join(failed.values()))
     choices = {}
+    remarks = list(given.remarks)
     for k, (joint, of) in enumerate(errors.items()):
         name, why = _choose(of)
         choices[joint] = name, f"{why}{fits[name][k].note}"
+        remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
+    given = replace(given, remarks=tuple(remarks))
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
+
+
+def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str]:
+    """Rows far off the chosen law, and an error that follows the velocity, a sentence each.
+
+    Only for rows in no order: along a motion, errors follow reversals and what precedes them.
+    """
+    error = joint.tau - torque_table.predict(model, joint).numpy()
+    # At rest, dry friction can have any value.
+    rows = np.flatnonzero(np.abs(joint.qd) > 3 * model.v_smooth)
+    if joint.time is not None or len(rows) < MINIMUM_ROWS:
+        return
+    rows, small = rows[np.argsort(joint.qd[rows])], SMALL * float(np.median(np.abs(joint.tau)))
+    own, left = f"{plain_name(type(model).__name__)} at {joint.name}", error[rows]
+    left = left - left.mean()
+    # If neighbours share more than half of the error, it is no chance and no single mistake.
+    common = max(0.5, 3 / math.sqrt(len(left))) * float(left @ left)
+    if float(left @ left) > len(left) * small**2 and float(left[1:] @ left[:-1]) > common:
+        yield (
+            f"Most of the error of {own} follows the velocity: the law has another shape, which "
+            "the intervals do not cover. Add neuro-fuzzy models, or a law of your own."
+        )
+        return
+    low, high = np.quantile(left, (0.25, 0.75))
+    reach = max(FENCE * (high - low), small)
+    far = rows[(left < low - reach) | (left > high + reach)]
+    if len(far):
+        off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:3])
+        more = f" and {len(far) - 3} more" * (len(far) > 3)
+        yield (
+            f"Torques far off {own}: {off}{more}. Check these rows; if they are mistakes, drop "
+            "them and fit again."
+        )
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +24,8 @@ from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
-from nfriction.signals import Motion
+from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, turns_between_samples
+from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
 
@@ -31,6 +33,8 @@ Array = NDArray[np.float64]
 FEWEST_FOR_CURVATURE = 5
 # With fewer blocks, one of the corrections would explain most of the torque by chance.
 FEWEST_BLOCKS = 20
+# Steps that are alike differ by less than this part; noise and counts must be smaller, too.
+ALIKE = 0.1
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -114,6 +118,9 @@ def likely_mistakes(
         not distinguish them, none if no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
+    # These spoil the balance, and a fit absorbs some wrong times in the inertia.
+    if broken := [*_broken(recordings, options)]:
+        return math.nan, (broken[0],)
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
@@ -134,6 +141,9 @@ def likely_mistakes(
     if len(recordings) > 1 and not zeroed:
         most = sound / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
+    # Near one position, a spring is like gravity, which is a simpler cause.
+    least = min((share for _, share in tested), default=math.inf)
+    tested += [x for x in _springs(plant, given) if options.diagnosis_tie * x[1] < least]
     found = [
         Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
     ]
@@ -155,6 +165,41 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     )
     known = not math.isnan(mistakes[0].unexplained)
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
+
+
+def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
+    """Recordings of wrapped angles, and those that lack or repeat rows under even times.
+
+    Between two steps before and two after it that are all alike, a step of twice their length lacks
+    a row, and one of zero repeats a row: no joint moves so.
+    """
+    for recording in recordings:
+        name = recording.name or "a recording"
+        wrapped = turns_between_samples(recording.q, gaps(recording.time)).any()
+        if wrapped and recording.unit == "rad":
+            text = f"positions of {name} are wrapped (unwrap them, as `numpy.unwrap(q, axis=0)`)"
+            yield Mistake(text, math.nan)
+        q, time = (sliding_window_view(x, 6, axis=0) for x in (recording.q, recording.time))
+        steps = np.diff(q)
+        mean = np.delete(steps, 2, -1).mean(-1)
+        apart, size = np.ptp(np.delete(steps, 2, -1), axis=-1), np.abs(mean)
+        noise = np.median(np.abs(np.diff(recording.q, n=2, axis=0)), axis=0)
+        seen = size * ALIKE > np.fmax(noise, count_seen(recording.q))
+        even = np.ptp(np.diff(time), axis=-1) < ALIKE * recording.sample_time
+        seen &= (apart < ALIKE * size) & even[:, None]
+        for factor, rows, remedy in (
+            (2, "missing", "use the logger's own time stamps"),
+            (0, "repeated", "drop repeated rows before rows are given their times"),
+        ):
+            # A row is lost for all joints. Noise causes half of this error more often.
+            found, half = (
+                int((seen.any(1) & ((np.abs(error) < ALIKE * size) | ~seen).all(1)).sum())
+                for error in (steps[..., 2] - x * mean for x in (factor, (1 + factor) / 2))
+            )
+            share = found / max(1, int(seen.any(1).sum()))
+            if found >= max(MINIMUM_SAMPLES, half) and share > options.clock_error[0]:
+                of = f"about {100 * share:.2g} % of the rows of {name} are {rows}"
+                yield Mistake(f"{of}, although `time` goes on evenly ({remedy})", math.nan)
 
 
 def _driven_without_torque(
@@ -342,17 +387,22 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
     data = plant.to_dict()
     if "buffers" in data:
         return  # they would override the corrected arguments
-    milli = {"length": 1e-3, "com": 1e-3}
+    motor = data.get("motor") or {}
+    given = data | motor
+    rotor, milli = "rotor_inertia" if motor else "armature", {"length": 1e-3, "com": 1e-3}
     mistakes: dict[str, dict[str, float]] = {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
         "lengths are in mm": milli,
         "lengths are in mm, and inertias in kg mm^2": {**milli, "inertia": 1e-6},
         "the rig is in g, mm and g mm^2": {**milli, "mass": 1e-3, "inertia": 1e-9},
-        **{f"inertias are in {unit}": {"inertia": f} for unit, f in UNITS_OF_INERTIA.items()},
     }
+    for unit, factor in UNITS_OF_INERTIA.items():
+        mistakes[f"inertias are in {unit}"] = {"inertia": factor}
+        mistakes[f"each `{rotor}` is in {unit}"] = {rotor: factor}
+        mistakes[f"inertias and each `{rotor}` are in {unit}"] = {"inertia": factor, rotor: factor}
     changes = {
-        text: {k: np.array(data[k]) * f for k, f in factors.items() if data.get(k) is not None}
+        text: {k: np.array(given[k]) * f for k, f in factors.items() if given.get(k) is not None}
         for text, factors in mistakes.items()
     }
     inertia = np.array(data.get("inertia") or ())
@@ -360,8 +410,10 @@ def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
         central = inertia - np.array(data["mass"]) * np.array(data["com"]) ** 2
         changes["inertias are about the joints, not about the mass centres"] = {"inertia": central}
     for text, change in changes.items():
-        if change and change.keys() <= data.keys():
+        if change and change.keys() <= given.keys():
             parts = {key: values.tolist() for key, values in change.items()}
+            if motor:
+                parts["motor"] = motor | {k: parts.pop(k) for k in motor if k in parts}
             # Some would be no mechanism, or a strange one.
             with suppress(ValueError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -611,6 +663,21 @@ def _growth(
     found = torch.linalg.lstsq(terms[seen], torque[seen], driver="gelsd").solution
     missed = [torque - known @ constant, torque - terms @ found]
     return float(found[-1]), torch.stack([x[left_out].square().sum() for x in missed])
+
+
+def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
+    """Each driven joint with a spring to the frame, whose rest is anywhere."""
+    needed = given.needed(plant)
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+        part = torch.zeros_like(given.tau)
+        part[:, j] = given.q[:, j]
+        stiffness = -_balance(given, given.tau - needed, part)[1]
+        kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
+        text = (
+            f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit}, which the rig lacks "
+            f"(subtract this times the position from the {kind} of {plant.joint_names[j]})"
+        )
+        yield text, _unexplained(plant, given, part)
 
 
 def balanced_delay(

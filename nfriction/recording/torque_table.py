@@ -217,7 +217,8 @@ class TorqueTable:
             if fast:
                 remarks.append(
                     f"The velocity of {', '.join(fast)} exceeds {FAST:g} rad/s, as degrees per "
-                    "second would; if so, read the table with `degrees=True`."
+                    "second or revolutions per minute would; if so, read the table with "
+                    '`degrees=True`, or columns={"qd": "qd:rpm"}.'
                 )
         return cls(tuple(joints), unit, "", tuple(remarks))
 
@@ -397,6 +398,11 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         remarks.append(
             f"The friction torque of {name} drives the joint on average, as with the wrong sign: "
             "it must be positive with positive velocity. If the sign is wrong, reverse it."
+        )
+    elif min(ways) > 0.0 and (tau.min() >= 0.0 or tau.max() <= 0.0):
+        remarks.append(
+            f"The friction torque of {name} has one sign in both directions, as without its sign "
+            "or with a load: give it the sign of the velocity, or subtract the torque of the load."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -132,9 +133,11 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
     # A joint's motion cannot be observed at two samples per second.
     slow = bool(np.median(step) >= 0.5)
     if slow:
+        units = ("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds")
+        unit, plain = units[min(2, int(math.log(2 * np.median(step), 1000)))]
         yield (
-            "`time` looks like milliseconds",
-            'if so, divide it by 1000, or read it with columns={"time": "time:ms"}',
+            f"`time` looks like {plain}",
+            f'if so, divide it, or read it with columns={{"time": "time:{unit}"}}',
         )
     if len(pauses):
         k = int(pauses[np.argmax(step[pauses])])

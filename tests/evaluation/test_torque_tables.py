@@ -207,6 +207,24 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
         read_models(tmp_path)
 
 
+@pytest.mark.parametrize("sd", [0.0, 0.02])
+def test_rows_far_off_and_a_shape_that_no_law_has_are_remarked(sd: float) -> None:
+    rng = np.random.default_rng(3)
+    qd = rng.uniform(-10, 10, 200)
+    noise = sd * rng.normal(size=200)
+    table = pd.DataFrame({"qd": qd, "tau": 1.5 * np.sign(qd) + 0.12 * qd + noise})
+    laws = ["coulomb", "coulomb-viscous", "stribeck"]
+    assert fit_torque(table, laws).table.remarks == ()
+    wrong = table.assign(tau=table.tau.where(~table.index.isin([10, 50]), 30.0))
+    (remark,) = fit_torque(wrong, laws).table.remarks
+    assert f"30 at {qd[10]:.4g} rad/s" in remark
+    assert f"30 at {qd[50]:.4g} rad/s" in remark
+    assert "more" not in remark
+    windage = table.assign(tau=0.02 * qd * np.abs(qd) + noise)
+    (remark,) = fit_torque(windage, laws).table.remarks
+    assert "follows the velocity" in remark
+
+
 def test_summary_and_notebook_show_choice_and_intervals() -> None:
     found = fit_torque(stribeck_table(), "coulomb-viscous,stribeck")
     for text in (repr(found), found.summary(), found._repr_html_()):

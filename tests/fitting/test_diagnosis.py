@@ -312,6 +312,18 @@ def test_mistakes_in_torques(name, change, finding):
         ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
+        ("driven", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
+        ("wheel", {"motor": Motor(50, rotor_inertia=120)}, "each `rotor_inertia` is in g cm^2"),
+        (
+            "driven",
+            {
+                "mass": [500, 300],
+                "length": [300, 250],
+                "com": [150, 120],
+                "inertia": [3.75e6, 1.56e6],
+            },
+            "the rig is in g, mm and g mm^2",
+        ),
     ],
 )
 def test_mistakes_in_rigs(name, rig, finding):
@@ -319,6 +331,33 @@ def test_mistakes_in_rigs(name, rig, finding):
     kind = Rotor if name == "wheel" else PendulumChain
     plant = kind(**{**{"motor": MOTOR, "wheel": WHEEL}.get(name, DOUBLE), **rig})
     assert finding in warnings_of(plant, q, tau)[0]
+
+
+@pytest.mark.parametrize(("name", "stiffness"), [("axis", 40.0), ("wheel", 1.5)])
+def test_a_spring_that_the_rig_lacks_is_named(name, stiffness):
+    plant, q, tau = measured(name)
+    named = warnings_of(plant, q, tau + stiffness * (q - 0.1))[0]
+    found = float(re.search(r"joint1 has a spring of (\S+) N", named)[1])
+    assert found == pytest.approx(stiffness, rel=0.02)
+    assert warnings_of(plant, q, tau) == ()
+
+
+@pytest.mark.parametrize(("times", "named"), [(2, "repeated"), (0, "missing")])
+def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
+    """A fit absorbs most of a wrong clock in the inertia, and seems good."""
+    plant, q, tau = measured("wheel", 1e-4)
+    rows = np.ones(len(q), dtype=int)
+    rows[np.random.default_rng(0).choice(len(q), len(q) // 30, replace=False)] = times
+    rows = np.repeat(np.arange(len(q)), rows)
+    found = warnings_of(plant, q[rows], tau[rows], time=STEP * np.arange(len(rows)))
+    assert f"% of the rows of a recording are {named}, although" in found[0]
+
+
+def test_wrapped_angles_are_no_elastic_joint():
+    plant, q, tau = measured("wheel")
+    with pytest.warns(UserWarning, match="looks wrapped"):
+        first = warnings_of(plant, 20 * q % (2 * math.pi), tau)[0]
+    assert "likely: positions of a recording are wrapped (unwrap them" in first
 
 
 def test_an_inertia_that_the_fit_corrects_is_no_mistake():

@@ -279,6 +279,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("t,q1\n0,0\n", "column time is missing; found t, q1.*columns="),
         ("time,q1,q3\n0,0,0\n", "column q2 is missing"),
         ("time,angle\n0,0\n", "column q1 is missing; found time, angle"),
+        ("time,speed\n0,0\n", "Without positions, add the integral of speed over time"),
         ("Zeit,Motorwinkel,Strom\n0,0,0\n", '"motor1": "Motorwinkel", "current1": "Strom"'),
         ("Zeit;Motorwinkel;Iq\n[ms];[deg];[mA]\n0;0;0\n", '"current1": "Iq"'),
         ("t_s,ang1,M1 (Nm)\n0,0,0\n", '"q1": "ang1", "tau1": "M1'),
@@ -423,10 +424,13 @@ def test_positions_of_a_slower_sensor_are_noticed(count: float, held: int) -> No
     assert len(found[::held]) == 2000 // held
 
 
-def test_milliseconds_are_noticed() -> None:
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+)
+def test_a_wrong_unit_of_time_is_noticed(factor: float, unit: str) -> None:
     recording = swing()
-    with pytest.warns(RecordingWarning, match="milliseconds"):
-        Recording(recording.time * 1e3, recording.q)
+    with pytest.warns(RecordingWarning, match=unit):
+        Recording(recording.time * factor, recording.q)
 
 
 def test_gaps_are_noticed_and_jitter_is_not() -> None:

@@ -107,8 +107,10 @@ def test_doubts_are_remarked() -> None:
     assert "looks wrapped (10 jumps" in TorqueTable.from_pandas(pd.DataFrame(wheel)).remarks[-1]
     one_way = TorqueTable.from_pandas(table(qd=np.abs(QD), tau=np.abs(QD)))
     assert "one direction only" in one_way.remarks[0]
+    unsigned = TorqueTable.from_pandas(table(tau=np.abs(table().tau)))
+    assert "has one sign in both directions" in unsigned.remarks[0]
     fast = TorqueTable.from_pandas(table(qd=np.rad2deg(2 * QD)))
-    assert "degrees per second" in fast.remarks[0]
+    assert "degrees per second or revolutions per minute" in fast.remarks[0]
     assert not TorqueTable.from_pandas(table(qd=1e3 * QD), columns={"qd": "qd:rpm"}).remarks
     assert not TorqueTable.from_pandas(table()).remarks
 

@@ -32,6 +32,7 @@ _LIKE_POSITION = re.compile(
     r"^(pos|ang|winkel|gelenk|joint|motor|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
+_LIKE_VELOCITY = re.compile(r"speed|vel|omega|drehzahl|geschw|^qd\d*$", re.IGNORECASE)
 _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
@@ -367,6 +368,9 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
     note = f" {unit!r} is not a known unit." if stem in found and not is_unit(unit) else ""
+    rates = [name for name in found if _LIKE_VELOCITY.search(name)]
+    if rates and missing[0].startswith("q") and not any(map(_LIKE_POSITION.search, found)):
+        note += f" Without positions, add the integral of {rates[0][:60]} over time as a column."
     lost = [columns.get(key, key) for key in missing[:10]]
     label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
     guessed = {} if columns else _guessed(found, _drives(table))
