@@ -1,8 +1,8 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
 First, the network is trained with fixed sets, and hold-out windows select the priors. Further
-inputs (`inputs`) are kept if law and network improve on hold-out windows. Training continues with
-the residual noise, with the prior of each group of parameters set by evidence, and moves the sets
+inputs (`inputs`) are kept if the network improves on hold-out windows. Training continues with the
+residual noise, with the prior of each group of parameters set by evidence, and moves the sets
 if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
 windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
 With several recordings, neither inputs nor the final network may be worse on hold-out recordings.
@@ -123,7 +123,7 @@ def _ripple(plant: Plant) -> str:
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:
-    """Inputs that improve law and network on hold-out windows (or none), and their contest."""
+    """Inputs that improve the network on hold-out windows (or none), and their contest."""
     task = plain.task
     chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
@@ -133,12 +133,11 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     cast("NeuroFuzzyModel", model).see(names)
     rival = _Contest(replace(seeing, model=model), start)
     new, old = rival.validation, plain.validation
-    if not gains(new.of_law, old.of_law, least=task.options.explained_ratio):
-        return (), plain
-    if new.several and gains(old.of_law_apart, new.of_law_apart):
+    # An input may show only in the network: the law alone need not gain.
+    if gains(old.of_law, new.of_law) or (new.several and gains(old.of_law_apart, new.of_law_apart)):
         return (), plain
     rival.train()
-    if not gains(rival.squares, plain.squares):
+    if not gains(rival.squares, plain.squares, least=task.options.explained_ratio):
         return (), plain
     # Friction of the constant law may drive a joint even if that of its network does not.
     return ((), plain) if inputs.drives(rival.found, len(task.model.law.names)) else (chosen, rival)
