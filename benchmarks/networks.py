@@ -37,7 +37,7 @@ from nfriction.signals import quantise
 
 LINK = {"mass": [0.2], "length": [0.4]}
 COUNTS, SECONDS, HELD_OUT = 8192, 3.0, 10
-LAWS = ("CVFM", "Stribeck", "NLFM", "LuGre", "direction", "network")
+LAWS = ("CVFM", "Stribeck", "NLFM", "LuGre", "one-sided", "network")
 Start = tuple[torch.Tensor, torch.Tensor]
 
 
@@ -67,7 +67,7 @@ def drawn(truth: str, random: np.random.Generator) -> FrictionModel:
     speed, stiffness = random.uniform(0.3, 2.0), dry / random.uniform(1e-3, 1e-2)
     if truth == "network":
         return rules(random)
-    if truth == "direction":
+    if truth == "one-sided":
         lean = scale * random.uniform(0.05, 0.2)
         return NFCVFM(1, [dry, viscous, lean], inputs=["direction"]).requires_grad_(False)
     damping = random.uniform(0.3, 1.0) * math.sqrt(stiffness * 0.01)
