@@ -8,7 +8,8 @@ seed draws, and prints how often the 95 % error bars along the swing hold the tr
 
 `twins` fits a network and its law to two short recordings, and simulates both on ten releases that
 no fit has seen. Truths are laws on one link, or effects of `nfriction twin --truth` on three links
-(ten times as slow). A network counts as worse if its median error is over 1 % above its law's.
+(ten times as slow). A model with a network or further inputs counts as accepted, and as worse if
+its median error is over 1 % above its law's.
 """
 
 import argparse
