@@ -151,7 +151,7 @@ def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[s
     law, plant = problem.friction.law.coefficients, problem.jacobian.plant
     losses = [f"{c.name} of {j}" for c in law if c.unit.startswith("N") for j in plant.joint_names]
     losses += [term.name for term in problem.variables.terms if term.to_none]
-    if problem.windows.tau.any() or not set(losses) <= set(at_zero):
+    if problem.windows.tau.any() or not losses or not set(losses) <= set(at_zero):
         return ()
     return (
         "a free motion fits best without any loss of energy: time runs backwards, or the torque of "
