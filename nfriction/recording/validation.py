@@ -134,10 +134,10 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
     slow = bool(np.median(step) >= 0.5)
     if slow:
         units = ("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds")
-        unit, plain = units[min(2, int(math.log(2 * np.median(step), 1000)))]
+        short, plain = units[min(2, int(math.log(2 * np.median(step), 1000)))]
         yield (
             f"`time` looks like {plain}",
-            f'if so, divide it, or read it with columns={{"time": "time:{unit}"}}',
+            f'if so, divide it, or read it with columns={{"time": "time:{short}"}}',
         )
     if len(pauses):
         k = int(pauses[np.argmax(step[pauses])])

@@ -433,6 +433,14 @@ def test_a_wrong_unit_of_time_is_noticed(factor: float, unit: str) -> None:
         Recording(recording.time * factor, recording.q)
 
 
+def test_an_axis_in_milliseconds_is_not_taken_for_a_wrapped_angle() -> None:
+    q = 1e-3 * np.arange(100)[:, None]
+    q[50:] -= 2 * np.pi
+    with pytest.warns(RecordingWarning) as caught:
+        Recording(np.arange(100.0), q, unit="m")
+    assert not any("wrapped" in str(w.message) for w in caught)
+
+
 def test_gaps_are_noticed_and_jitter_is_not() -> None:
     time = np.arange(100) / 100
     jitter = np.random.default_rng(0).uniform(-4e-3, 4e-3, 100)
