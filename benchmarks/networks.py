@@ -134,10 +134,10 @@ def twins(truths: list[str], first: int, seeds: int, model: str) -> None:
             kept = "constant law is kept" in net.status
             before, after = (1e3 * errors(f, twin) for f in (law, net))
             a, b = np.median(before), np.median(after)
-            accepted += not kept or bool(net.inputs)
             changed = not kept or bool(net.inputs)
-            worse += bool(changed and b > 1.01 * a)
-            words = "WORSE" if changed and b > 1.01 * a else "kept" if kept else "better"
+            lost = changed and bool(b > 1.01 * a)
+            accepted, worse = accepted + changed, worse + lost
+            words = "WORSE" if lost else "kept" if kept else "better"
             inputs = ", ".join(gain.name for gain in net.inputs)
             print(f"{truth + ' ' + str(seed):16} {a:8.3f} -> {b:8.3f} mrad  {words:6} {inputs:16} "
                   f"worse on {np.sum(after > 1.01 * before)} of {len(after)}, "

@@ -75,7 +75,7 @@ class Fits(NamedTuple):
 
 
 class FitsInterrupted(KeyboardInterrupt):
-    """A Ctrl-C while models were fitted, with the fits finished by then by part."""
+    """A Ctrl-C while models are fitted; `fits` are those finished by then, by part."""
 
     def __init__(self, fits: dict[str, Fits]) -> None:
         super().__init__()
@@ -142,8 +142,8 @@ def fit_models(
                 logger.info("%s: %s (%.3g s)", label, result.status, seconds)
     except KeyboardInterrupt as interrupt:
         for of in results.values():
-            left = (name for name in names if name not in of.found)
-            of.failed.update({name: of.failed.get(name, INTERRUPTED) for name in left})
+            for name in set(names).difference(of.found):
+                of.failed.setdefault(name, INTERRUPTED)
         raise FitsInterrupted(_in_order(results, names)) from interrupt
     if not any(of.found for of in results.values()):
         raise errors[0]

@@ -119,8 +119,8 @@ def likely_mistakes(
     """
     given = _collect(recordings, motions, options)
     # These spoil the balance, and a fit absorbs some wrong times in the inertia.
-    if broken := [*_broken(recordings, options)]:
-        return math.nan, (broken[0],)
+    if broken := next(_broken(recordings, options), None):
+        return math.nan, (broken,)
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
@@ -674,8 +674,8 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         stiffness = -_balance(given, given.tau - needed, part)[1]
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (
-            f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit}, which the rig lacks "
-            f"(subtract this times the position from the {kind} of {plant.joint_names[j]})"
+            f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit} that the rig lacks "
+            f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]})"
         )
         yield text, _unexplained(plant, given, part)
 

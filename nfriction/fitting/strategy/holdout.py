@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows, moving_segments
-from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
@@ -68,21 +67,20 @@ def recording_splits(windows: Windows, folds: int) -> list[tuple[Windows, Window
     return [(windows.subset(group != k), windows.subset(group == k)) for k in group.unique()]
 
 
-def verdict(network: Tensor, law: Tensor, blocks: str = "windows") -> str:
+def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float = 1.0) -> str:
     """Sentence that rejects a network, from squared errors on each window, (window,).
 
-    `blocks` names the kind of data that was held out.
+    `blocks` names the kind of data that was held out, `least` the required gain (see `gains`).
     """
     ratio, spread = log_ratio(network, law)
     if math.isinf(ratio):
         return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
     change = 100 * math.expm1(ratio)
-    least = 100 * (DEFAULTS.explained_ratio - 1)
-    required = "" if change > 0 else f" ({least:.0f} % and more than the scatter are required)"
+    gain = f" ({100 * (least - 1):.0f} % and more than the scatter are required)"
     return (
         f"Network rejected: on hold-out {blocks} it was {abs(change):.3g} % "
         f"{'worse' if change > 0 else 'better'} than its constant law, with a standard error of "
-        f"{100 * spread:.2g} %{required}; the constant law is kept."
+        f"{100 * spread:.2g} %{'' if change > 0 else gain}; the constant law is kept."
     )
 
 

@@ -210,12 +210,14 @@ class _Contest:
             end = best.end
             if self.accepts(best) and not end.stopped:
                 note = validation.lost_apart(best)
-                end = end if note else validation.fit_all(best)
-                note = note or validation.lost_by(end)
+                if not note:
+                    end = validation.fit_all(best)
+                    note = validation.lost_by(end)
         except holdout.StoppedError:
             end = best.end.as_stopped()
         if not self.accepts(best):
-            note = holdout.verdict(best.squares, validation.of_law)
+            least = task.options.explained_ratio
+            note = holdout.verdict(best.squares, validation.of_law, least=least)
         if note:
             return self._kept(model, note, converged=not end.stopped)
         found = copy.deepcopy(end.problem.friction)
