@@ -168,6 +168,13 @@ def task():
         # An input that only the network shows.
         ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, True, True),
         ({"of_law": 0.8 * ONE, "error": 0.7 * ONE, "apart": 1.1 * ONE}, False, False, False),
+        # A loss of 1.2 standard errors on hold-out recordings does not overrule a clear gain.
+        (
+            {"of_law": 0.8 * ONE, "error": 0.7 * ONE, "apart": torch.linspace(0.7, 1.6, 6)},
+            False,
+            True,
+            True,
+        ),
     ],
 )
 def test_inputs_have_to_win_for_the_network_and_not_to_lose_for_its_law(

@@ -132,9 +132,11 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
     rival = _Contest(replace(seeing, model=model), start)
-    new, old = rival.validation, plain.validation
+    new, old, chance = rival.validation, plain.validation, task.options.input_chance
     # An input may show only in the network: the law alone need not gain.
-    if gains(old.of_law, new.of_law) or (new.several and gains(old.of_law_apart, new.of_law_apart)):
+    if gains(old.of_law, new.of_law, chance):
+        return (), plain
+    if new.several and gains(old.of_law_apart, new.of_law_apart, chance):
         return (), plain
     rival.train()
     if not gains(rival.squares, plain.squares, least=task.options.explained_ratio):
@@ -494,7 +496,8 @@ class Validation:
         Windows between those of training show the same motion, and hide that a network follows what
         is particular to a recording. A gain is not required, because there is less to train on.
         """
-        if not self.several or not gains(self.of_law_apart, apart := self.apart(trial)):
+        chance = self.options.input_chance
+        if not self.several or not gains(self.of_law_apart, apart := self.apart(trial), chance):
             return ""
         return holdout.verdict(apart, self.of_law_apart, "recordings")
 
