@@ -138,15 +138,16 @@ def likely_mistakes(
         else:
             tested.append((f"{term.name} is {1 + x:.3g} times that of the rig", share))
     # With different zeros, recordings of the same rig have different balances.
+    unlike = []
     if len(recordings) > 1 and not zeroed:
-        most = sound / options.diagnosis_ratio
+        unlike = [*_unlike_zeros(plant, recordings, given, options)]
+        most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
     # Near one position, a spring is like gravity, which is a simpler cause.
     least = min((share for _, share in tested), default=math.inf)
     tested += [x for x in _springs(plant, given) if options.diagnosis_tie * x[1] < least]
-    found = [
-        Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
-    ]
+    explain = [x for x in tested if x[1] < sound / options.diagnosis_ratio]
+    found = [Mistake(text, share) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
@@ -278,16 +279,67 @@ def _odd_one_out(
     data = _collect(recordings, motions, options)
     # Time starts again where the first one ends.
     own = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0) == 0
-    driven = np.flatnonzero(data.tau.abs().amax(0)).tolist()
-    rig, needed = [], data.needed(plant)
-    for term in plant_parameters(plant, driven=driven, options=options):
-        if term.ratio or term.name.startswith("angle offset"):
-            # Of the torque that a small change of the term takes, only the shape matters.
-            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
-            rig.append(own * (data.needed(plant.replace(**changed)) - needed))
+    rig = [own * part for parts in _torques_of_terms(plant, data, options) for part in parts]
     if causes or (rig and _unexplained(plant, data, torch.stack(rig, -1)) < most):
         text = f"{name} is from another rig than the others, or was recorded differently"
         yield text + f" ({', or '.join(x.text for x in causes)})" * bool(causes), share
+
+
+def _torques_of_terms(
+    plant: Plant, data: _Data, options: FitOptions
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Torque per unit of each encoder zero, and of each term of inertia and gravity."""
+    driven, needed = np.flatnonzero(data.tau.abs().amax(0)).tolist(), data.needed(plant)
+    zeros: list[Tensor] = []
+    rig: list[Tensor] = []
+    for term in plant_parameters(plant, driven=driven, options=options):
+        zero = term.name.startswith("angle offset")
+        if term.ratio or zero:
+            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
+            part = (data.needed(plant.replace(**changed)) - needed) / 1e-3
+            (zeros if zero else rig).append(part)
+    return zeros, rig
+
+
+def _unlike_zeros(
+    plant: Plant, recordings: Sequence[Recording], data: _Data, options: FitOptions
+) -> Iterator[tuple[str, float]]:
+    """Joints whose encoder zero differs between recordings, and the share left with own zeros.
+
+    By more than a zero is usually off, because a wrong law looks like a small difference, and by
+    more than the scatter of its estimates with each piece of the data left out.
+    """
+    pieces, blocks = options.drift_pieces * len(recordings), len(data.q) // data.block
+    zeros, rig = _torques_of_terms(plant, data, options)
+    if not zeros or blocks < 2 * pieces:
+        return
+    # Time starts again with each recording.
+    number = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0)
+    own = [(number == k) * part for part in zeros for k in range(len(recordings))]
+    torque = data.tau - data.needed(plant)
+    left, design, _ = _equations(data, torque, torch.stack(own + rig, -1))
+    scale = design.square().mean((0, 1)).sqrt()
+    # A joint at rest shows no zero.
+    shown = (scale[: len(own)] > 0).reshape(len(zeros), -1)
+    scale = scale.clamp_min(torch.finfo(scale.dtype).tiny)
+    piece, found = torch.arange(blocks) * pieces // blocks, []
+    for rows in (piece != k for k in range(-1, pieces)):
+        terms, known = (design[rows] / scale).flatten(0, 1), left[rows].reshape(-1, 1)
+        least = torch.linalg.lstsq(terms, known, rcond=1e-9, driver="gelsd")
+        found.append((least.solution[:, 0] / scale)[: len(own)].reshape(len(zeros), -1))
+    sure, said = student_quantile(pieces - 1, 1 - options.drift_chance / 2), []
+    names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    for j, seen in enumerate(shown):
+        places = seen.nonzero().flatten()
+        order = places[found[0][j, places].argsort()].tolist()
+        change, *others = (float(x[j, order[-1]] - x[j, order[0]]) if order else 0.0 for x in found)
+        if change - sure * math.sqrt((pieces - 1) * np.var(others)) > options.angle_term[1]:
+            joint = plant.joint_names[plant.joints - len(zeros) + j]
+            pair = " and ".join(names[k] for k in sorted({order[0], order[-1]}))
+            said.append(f"{joint} by {math.degrees(change):.2g} degrees between {pair}")
+    if said:
+        text = f'encoder zeros differ: {", ".join(said)} (`encoder_reference="per_recording"`)'
+        yield text, _unexplained(plant, data, torch.stack(own, -1))
 
 
 def _collect(
@@ -759,6 +811,32 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
     """Mean square of unexplained torque, (joint,), and the factor of the first `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
+    left, terms, weight = _equations(data, torque, extra)
+    # Friction that adds energy is excluded. A factor of either sign is the difference of two
+    # positive ones.
+    free = terms[..., : terms.shape[-1] - data.friction.shape[-1]]
+    design = torch.cat([terms, -free], -1)
+    scaled = design.reshape(-1, design.shape[-1]).numpy()
+    norm = np.linalg.norm(scaled, axis=0)
+    norm[norm == 0] = 1.0
+    rows = np.column_stack([scaled / norm, left.flatten().numpy()])
+    if not np.isfinite(rows).all():
+        return torch.full_like(weight, math.inf), math.nan
+    # The triangular factor has the same normal equations.
+    _, factor = np.linalg.qr(rows)
+    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
+    residual = weight * (left - design @ torch.as_tensor(found))
+    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
+    return residual.square().mean(0), float(factor_of_extra)
+
+
+def _equations(
+    data: _Data, torque: Tensor, extra: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Torque (block, joint) and what may explain it (block, joint, column) over a weight (joint,).
+
+    The columns are `extra`, the offsets of the drives, and friction.
+    """
     left = data.moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
@@ -767,19 +845,5 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
         own.append(-data.moving[..., None] * data.mean(extra.reshape(*data.q.shape, -1)))
     # A drive may have an offset.
     offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]
-    free = torch.cat([*own, offsets], -1)
-    # Friction that adds energy is excluded. A factor of either sign is the difference of two
-    # positive ones.
-    design = torch.cat([free, data.friction, -free], -1)
-    scaled = (design / weight[:, None]).reshape(-1, design.shape[-1]).numpy()
-    norm = np.linalg.norm(scaled, axis=0)
-    norm[norm == 0] = 1.0
-    rows = np.column_stack([scaled / norm, (left / weight).flatten().numpy()])
-    if not np.isfinite(rows).all():
-        return torch.full_like(weight, math.inf), math.nan
-    # The triangular factor has the same normal equations.
-    _, factor = np.linalg.qr(rows)
-    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
-    residual = left - design @ torch.as_tensor(found)
-    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
-    return residual.square().mean(0), float(factor_of_extra)
+    terms = torch.cat([*own, offsets, data.friction], -1)
+    return left / weight, terms / weight[:, None], weight

@@ -559,7 +559,24 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
     assert task.per_recording
     assert not task.mistakes
     shared = prepare_task(CVFM(2), plant, recordings, FitOptions(encoder_reference="shared"))
-    assert "from another rig" in shared.mistakes[0]
+    assert re.search("zeros differ: .* 1.7 degrees .* 2.9 degrees .*per_rec", shared.mistakes[0])
+
+
+@pytest.mark.parametrize("degrees", [(3.0, 0.0), (0.0, 3.0), (0.0, 0.0)])
+def test_an_encoder_that_was_homed_anew_is_named(degrees):
+    """Also if friction is most of the torque, so that less than half is left over."""
+    plant = PendulumChain(**DOUBLE)
+    model = CVFM(2, [[0.02, 0.004], [0.008, 0.003]], v_smooth=0.01).requires_grad_(False)
+    starts = (1.2, -0.5), (0.9, 0.7)
+    recordings = [swing(plant, model, start=start, seconds=6.0) for start in starts]
+    q = recordings[1].q + np.radians(degrees)
+    recordings[1] = recordings[1]._replace(q=q, name="after")
+    task = prepare_task(CVFM(2), plant, recordings, FitOptions())
+    joints = [x for x, off in zip(plant.joint_names, degrees, strict=True) if off]
+    assert len(task.mistakes) == len(joints)
+    for found, joint in zip(task.mistakes, joints, strict=True):
+        assert re.match(rf"encoder zeros differ: {joint} by (2\.9|3|3\.1) degrees", found)
+        assert "and after (`encoder_reference" in found
 
 
 @pytest.mark.parametrize("rounded", [True, False])
