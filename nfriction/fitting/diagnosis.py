@@ -24,7 +24,7 @@ from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
-from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, turns_between_samples
+from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, time_unit, turns_between_samples
 from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
@@ -124,6 +124,12 @@ def likely_mistakes(
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
+    # Inertias or torques wrong by the square of a thousand would have the same effect.
+    if unit := time_unit(recordings[0].time):
+        short, _, rate = unit
+        share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+        if share < stated / options.diagnosis_ratio:
+            return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)

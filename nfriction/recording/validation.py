@@ -130,11 +130,9 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
     """Signs that units or time stamps are wrong, each with its remedy."""
     step = np.diff(time)
     pauses = gaps(time)
-    # A joint's motion cannot be observed at two samples per second.
-    slow = bool(np.median(step) >= 0.5)
+    slow = time_unit(time)
     if slow:
-        units = ("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds")
-        short, plain = units[min(2, int(math.log(2 * np.median(step), 1000)))]
+        short, plain, _ = slow
         yield (
             f"`time` looks like {plain}",
             f'if so, divide it, or read it with columns={{"time": "time:{short}"}}',
@@ -179,6 +177,16 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
             f"`q` of {wrapped} looks wrapped ({jumps.sum()} jumps of about a turn)",
             "if so, unwrap it with `numpy.unwrap(q, axis=0)`",
         )
+
+
+def time_unit(time: Array) -> tuple[str, str, float] | None:
+    """The unit that stamps seem to have: short, in words, per second; None if they are in s.
+
+    A joint's motion cannot be observed at two samples per second.
+    """
+    step = float(np.median(np.diff(time)))
+    units = ("ms", "milliseconds", 1e3), ("us", "microseconds", 1e6), ("ns", "nanoseconds", 1e9)
+    return units[min(2, int(math.log(2 * step, 1000)))] if step >= 0.5 else None
 
 
 def held_samples(q: Array) -> NDArray[np.intp]:

@@ -384,6 +384,16 @@ def test_mistakes_in_conventions_and_time(name):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
 
+@pytest.mark.parametrize("name", ["free", "motor", "axis"])
+@pytest.mark.parametrize(("unit", "rate"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_of_times_in_another_unit_the_unit_alone_is_named(name, unit, rate):
+    """An inertia or torque that is wrong by the square of the factor would explain as much."""
+    plant, q, tau = measured(name)
+    with pytest.warns(UserWarning, match="`time` looks like"):
+        first = warnings_of(plant, q, tau, time=rate * STEP * np.arange(len(q)))[0]
+    assert first.startswith(f"A mistake in data or rig is likely: time is in {unit}. ")
+
+
 def test_exchanged_columns_are_named():
     plant, q, tau = measured("driven")
     swapped = (np.ascontiguousarray(x[:, ::-1]) for x in (q, tau))
