@@ -35,6 +35,8 @@ FEWEST_FOR_CURVATURE = 5
 FEWEST_BLOCKS = 20
 # Steps that are alike differ by less than this part; noise and counts must be smaller, too.
 ALIKE = 0.1
+# Logarithms of the ratios between which gears of robots lie.
+LOG_RATIOS = math.log(1.5), math.log(300.0)
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -78,6 +80,11 @@ class _Data:
     def needed(self, plant: Plant) -> Tensor:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
+
+    @cached_property
+    def number(self) -> Tensor:
+        """Number of each sample's recording, (sample, 1): time starts again with each."""
+        return (self.time.diff(dim=0, prepend=self.time[:1]) < 0).cumsum(0)
 
     @cached_property
     def moving(self) -> Tensor:
@@ -149,9 +156,10 @@ def likely_mistakes(
         unlike = [*_unlike_zeros(plant, recordings, given, options)]
         most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
-    # Near one position, a spring is like gravity, which is a simpler cause.
+    # Near one position, a spring is like gravity, and a ratio may be that of units: simpler causes.
     least = min((share for _, share in tested), default=math.inf)
-    tested += [x for x in _springs(plant, given) if options.diagnosis_tie * x[1] < least]
+    rare = *_springs(plant, given), *_geared(plant, convention, given)
+    tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
     explain = [x for x in tested if x[1] < sound / options.diagnosis_ratio]
     found = [Mistake(text, share) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
@@ -283,9 +291,8 @@ def _odd_one_out(
         return
     _, causes = likely_mistakes(plant, recordings[:1], motions[:1], convention, few)
     data = _collect(recordings, motions, options)
-    # Time starts again where the first one ends.
-    own = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0) == 0
-    rig = [own * part for parts in _torques_of_terms(plant, data, options) for part in parts]
+    zeros, terms = _torques_of_terms(plant, data, options)
+    rig = [(data.number == 0) * part for part in zeros + terms]
     if causes or (rig and _unexplained(plant, data, torch.stack(rig, -1)) < most):
         text = f"{name} is from another rig than the others, or was recorded differently"
         yield text + f" ({', or '.join(x.text for x in causes)})" * bool(causes), share
@@ -296,15 +303,12 @@ def _torques_of_terms(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Torque per unit of each encoder zero, and of each term of inertia and gravity."""
     driven, needed = np.flatnonzero(data.tau.abs().amax(0)).tolist(), data.needed(plant)
-    zeros: list[Tensor] = []
-    rig: list[Tensor] = []
+    found: tuple[list[Tensor], list[Tensor]] = ([], [])
     for term in plant_parameters(plant, driven=driven, options=options):
-        zero = term.name.startswith("angle offset")
-        if term.ratio or zero:
+        if term.ratio or term.name.startswith("angle offset"):
             changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
-            part = (data.needed(plant.replace(**changed)) - needed) / 1e-3
-            (zeros if zero else rig).append(part)
-    return zeros, rig
+            found[term.ratio].append((data.needed(plant.replace(**changed)) - needed) / 1e-3)
+    return found
 
 
 def _unlike_zeros(
@@ -319,12 +323,11 @@ def _unlike_zeros(
     zeros, rig = _torques_of_terms(plant, data, options)
     if not zeros or blocks < 2 * pieces:
         return
-    # Time starts again with each recording.
-    number = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0)
-    own = [(number == k) * part for part in zeros for k in range(len(recordings))]
-    torque = data.tau - data.needed(plant)
-    left, design, _ = _equations(data, torque, torch.stack(own + rig, -1))
+    own = [(data.number == k) * part for part in zeros for k in range(len(recordings))]
+    left, design, _ = _equations(data, data.tau - data.needed(plant), torch.stack(own + rig, -1))
     scale = design.square().mean((0, 1)).sqrt()
+    if not scale.isfinite().all():
+        return
     # A joint at rest shows no zero.
     shown = (scale[: len(own)] > 0).reshape(len(zeros), -1)
     scale = scale.clamp_min(torch.finfo(scale.dtype).tiny)
@@ -595,9 +598,7 @@ def changing_friction(
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
-    time = data.mean(data.time)
-    # Time starts again with each recording.
-    number = (time.diff(dim=0, prepend=time[:1]) < 0).cumsum(0).to(time)
+    time, number = data.mean(data.time), data.mean(data.number.to(data.time))
     clocks = {"during a recording": time, "from the first recording to the last": number}
     for j in range(plant.joints):
         *means, sliding = _of_sliding(plant, data, j, options)
@@ -738,6 +739,28 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         yield text, _unexplained(plant, given, part)
 
 
+def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator[tuple[str, float]]:
+    """Each joint, and all, as if recorded at the motor, before a gear of the best ratio."""
+    if not isinstance(plant, PendulumChain) or not given.tau.any():
+        return
+    first, eye = plant.first_link, np.eye(plant.joints)
+    q = convention.position_from_joint(given.q.numpy(), first)
+    rates = [convention.rate_from_joint(x.numpy(), first) for x in (given.qd, given.qdd)]
+    every = [("all positions are", eye.sum(0))] * (plant.joints > 1)
+    alone = [(f"{name}'s position is", eye[j]) for j, name in enumerate(plant.joint_names)]
+    for what, group in (*alone, *every):
+
+        def left(x: float, group: Array = group) -> float:
+            scale = np.exp(-x * group)
+            moved = (convention.rate_to_joint(rate * scale, first) for rate in rates)
+            at = torch.as_tensor(convention.position_to_joint(q * scale, first))
+            qd, qdd = map(torch.as_tensor, moved)
+            return _unexplained(plant, replace(given, q=at, qd=qd, qdd=qdd))
+
+        ratio, share = _best(left, *LOG_RATIOS, 41)
+        yield f"{what} {math.exp(ratio):.3g} times too large (of the motor, before its gear)", share
+
+
 def balanced_delay(
     plant: Plant,
     recordings: Sequence[Recording],
@@ -768,15 +791,15 @@ def _drifting_clock(
 
 
 def _best(
-    unexplained: Callable[[float], float], lowest: float, highest: float
+    unexplained: Callable[[float], float], lowest: float, highest: float, count: int = 9
 ) -> tuple[float, float]:
     """The value with the smallest unexplained share, and that share."""
     from scipy.optimize import minimize_scalar  # slow to import
 
     # The valley is as wide as a swing, so that a coarse grid finds it.
-    grid = np.linspace(lowest, highest, 9)
+    grid = np.linspace(lowest, highest, count)
     best = int(np.argmin([unexplained(x) for x in grid]))
-    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 8)])
+    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, count - 1)])
     close = 5e-4 * (highest - lowest)
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": close})
     return float(found.x), float(found.fun)

@@ -273,6 +273,8 @@ def test_a_torque_held_for_long_steps_is_no_delay():
         ("driven", lambda q: q + np.array([0, math.pi]), "joint2's position is 180 degrees off"),
         ("driven", lambda q: later(q, 10), "positions are recorded 2"),
         ("motor", np.degrees, "positions are in degrees"),
+        ("motor", lambda q: 5 * q, "too large (of the motor, before its gear)"),
+        ("driven", lambda q: 50 * q, "all positions are 50 times"),
         ("axis", lambda q: 1e3 * q, "positions are in mm"),
     ],
 )  # fmt: skip
