@@ -132,11 +132,10 @@ def likely_mistakes(
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
     # Inertias or torques wrong by the square of a thousand would have the same effect.
-    if unit := time_unit(recordings[0].time):
-        short, _, rate = unit
-        share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
-        if share < stated / options.diagnosis_ratio:
-            return stated, (Mistake(f"time is in {short}", share),)
+    short, _, rate = time_unit(recordings[0].time) or ("s", "seconds", 1.0)
+    share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+    if share < stated / options.diagnosis_ratio:
+        return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)

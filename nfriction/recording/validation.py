@@ -130,8 +130,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
     """Signs that units or time stamps are wrong, each with its remedy."""
     step = np.diff(time)
     pauses = gaps(time)
-    slow = time_unit(time)
-    if slow:
+    if slow := time_unit(time):
         short, plain, _ = slow
         yield (
             f"`time` looks like {plain}",
