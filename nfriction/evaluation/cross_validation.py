@@ -247,7 +247,7 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     if not math.isfinite(best.error):
         simplest = min(candidates, key=lambda c: c.parameters)
         return simplest.name, "every model diverged on a block left out; the simplest is chosen."
-    tied = [c for c in candidates if _indistinguishable(c, best)]
+    tied = [c for c in candidates if indistinguishable(c, best)]
     chosen = min(tied, key=lambda c: (c.parameters, c.error))
     if chosen is not best:
         return chosen.name, (
@@ -266,7 +266,7 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     )
 
 
-def _indistinguishable(one: Candidate, best: Candidate) -> bool:
+def indistinguishable(one: Candidate, best: Candidate) -> bool:
     """True if two errors differ by no more than their scatter over the blocks explains."""
     if not math.isfinite(one.error):
         return False

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
+from nfriction.evaluation.cross_validation import Candidate, indistinguishable
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting import torque_table
 from nfriction.fitting.options import DEFAULTS, FitOptions
@@ -54,6 +54,8 @@ WITH_BOTH = ("load-slip",)
 FENCE = 3.0
 # Errors below this part of the median torque do not matter.
 SMALL = 0.01
+# A drive holds a speed within this part of it.
+SAME_SPEED = 0.02
 
 
 class TorqueScore(NamedTuple):
@@ -330,7 +332,10 @@ def fit_torque(
     choices = {}
     remarks = list(given.remarks)
     for k, (joint, of) in enumerate(errors.items()):
-        name, why = _choose(of)
+        shown = _shown(given.joints[k], of)
+        name, why = _choose(shown)
+        hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
+        why += f"; too few speeds to show the shape of {hidden}" * bool(hidden)
         choices[joint] = name, f"{why}{fits[name][k].note}"
         remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
     given = replace(given, remarks=tuple(remarks))
@@ -370,6 +375,21 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
         )
 
 
+def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
+    """Models whose law has no more coefficients than the joint has speeds; all if none has.
+
+    Any other passes through the mean torque of every speed, and repeats show only the noise.
+    """
+    count, last = 0, 0.0
+    for speed in np.sort(np.abs(joint.qd)).tolist():
+        if speed > (1 + SAME_SPEED) * last:
+            count, last = count + 1, speed
+    laws = {c: model_by_name(c.name).definition for c in candidates}
+    # The deflections of a law with memory follow the motion, not its speeds.
+    found = [c for c, law in laws.items() if law.memory or len(law.coefficients) <= count]
+    return found or candidates
+
+
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     """The model to use and the reason.
 
@@ -404,16 +424,16 @@ def _percent(more: Candidate, less: Candidate) -> str:
 
 
 def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
-    """The model with fewest parameters whose error is within a tolerance of the least, and why."""
+    """The model with fewest parameters whose error chance may raise above the least, and why."""
     least = min(candidates, key=lambda c: c.error)
-    near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
+    near = [c for c in candidates if c is least or indistinguishable(c, least)]
     # A dropped network equals its law but for rounding: then the law.
     chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:
         number = "fewer" if chosen.parameters < least.parameters else "no more"
         return chosen, (
-            f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with "
-            f"{number} parameters"
+            f"not distinguishable from the least, of {plain_name(least.name)}, with {number} "
+            "parameters"
         )
     others = sorted(c.error for c in candidates if c is not least)
     if not others:

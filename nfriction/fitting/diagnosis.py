@@ -24,7 +24,7 @@ from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
-from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, turns_between_samples
+from nfriction.recording.validation import MINIMUM_SAMPLES, gaps, time_unit, turns_between_samples
 from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
@@ -35,6 +35,8 @@ FEWEST_FOR_CURVATURE = 5
 FEWEST_BLOCKS = 20
 # Steps that are alike differ by less than this part; noise and counts must be smaller, too.
 ALIKE = 0.1
+# Logarithms of the ratios between which gears of robots lie.
+LOG_RATIOS = math.log(1.5), math.log(300.0)
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -78,6 +80,11 @@ class _Data:
     def needed(self, plant: Plant) -> Tensor:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
+
+    @cached_property
+    def number(self) -> Tensor:
+        """Number of each sample's recording, (sample, 1): time starts again with each."""
+        return (self.time.diff(dim=0, prepend=self.time[:1]) < 0).cumsum(0)
 
     @cached_property
     def moving(self) -> Tensor:
@@ -124,6 +131,11 @@ def likely_mistakes(
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
+    # Inertias or torques wrong by the square of a thousand would have the same effect.
+    short, _, rate = time_unit(recordings[0].time) or ("s", "seconds", 1.0)
+    share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+    if share < stated / options.diagnosis_ratio:
+        return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)
@@ -138,15 +150,17 @@ def likely_mistakes(
         else:
             tested.append((f"{term.name} is {1 + x:.3g} times that of the rig", share))
     # With different zeros, recordings of the same rig have different balances.
+    unlike = []
     if len(recordings) > 1 and not zeroed:
-        most = sound / options.diagnosis_ratio
+        unlike = [*_unlike_zeros(plant, recordings, given, options)]
+        most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
-    # Near one position, a spring is like gravity, which is a simpler cause.
+    # Near one position, a spring is like gravity, and a ratio may be that of units: simpler causes.
     least = min((share for _, share in tested), default=math.inf)
-    tested += [x for x in _springs(plant, given) if options.diagnosis_tie * x[1] < least]
-    found = [
-        Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
-    ]
+    rare = *_springs(plant, given), *_geared(plant, convention, given)
+    tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
+    explain = [x for x in tested if x[1] < sound / options.diagnosis_ratio]
+    found = [Mistake(text, share) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
@@ -276,18 +290,64 @@ def _odd_one_out(
         return
     _, causes = likely_mistakes(plant, recordings[:1], motions[:1], convention, few)
     data = _collect(recordings, motions, options)
-    # Time starts again where the first one ends.
-    own = (data.time.diff(dim=0, prepend=data.time[:1]) < 0).cumsum(0) == 0
-    driven = np.flatnonzero(data.tau.abs().amax(0)).tolist()
-    rig, needed = [], data.needed(plant)
-    for term in plant_parameters(plant, driven=driven, options=options):
-        if term.ratio or term.name.startswith("angle offset"):
-            # Of the torque that a small change of the term takes, only the shape matters.
-            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
-            rig.append(own * (data.needed(plant.replace(**changed)) - needed))
+    zeros, terms = _torques_of_terms(plant, data, options)
+    rig = [(data.number == 0) * part for part in zeros + terms]
     if causes or (rig and _unexplained(plant, data, torch.stack(rig, -1)) < most):
         text = f"{name} is from another rig than the others, or was recorded differently"
         yield text + f" ({', or '.join(x.text for x in causes)})" * bool(causes), share
+
+
+def _torques_of_terms(
+    plant: Plant, data: _Data, options: FitOptions
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Torque per unit of each encoder zero, and of each term of inertia and gravity."""
+    driven, needed = np.flatnonzero(data.tau.abs().amax(0)).tolist(), data.needed(plant)
+    found: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for term in plant_parameters(plant, driven=driven, options=options):
+        if term.ratio or term.name.startswith("angle offset"):
+            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
+            found[term.ratio].append((data.needed(plant.replace(**changed)) - needed) / 1e-3)
+    return found
+
+
+def _unlike_zeros(
+    plant: Plant, recordings: Sequence[Recording], data: _Data, options: FitOptions
+) -> Iterator[tuple[str, float]]:
+    """Joints whose encoder zero differs between recordings, and the share left with own zeros.
+
+    By more than a zero is usually off, because a wrong law looks like a small difference, and by
+    more than the scatter of its estimates with each piece of the data left out.
+    """
+    pieces, blocks = options.drift_pieces * len(recordings), len(data.q) // data.block
+    zeros, rig = _torques_of_terms(plant, data, options)
+    if not zeros or blocks < 2 * pieces:
+        return
+    own = [(data.number == k) * part for part in zeros for k in range(len(recordings))]
+    left, design, _ = _equations(data, data.tau - data.needed(plant), torch.stack(own + rig, -1))
+    scale = design.square().mean((0, 1)).sqrt()
+    if not scale.isfinite().all():
+        return
+    # A joint at rest shows no zero.
+    shown = (scale[: len(own)] > 0).reshape(len(zeros), -1)
+    scale = scale.clamp_min(torch.finfo(scale.dtype).tiny)
+    piece, found = torch.arange(blocks) * pieces // blocks, []
+    for rows in (piece != k for k in range(-1, pieces)):
+        terms, known = (design[rows] / scale).flatten(0, 1), left[rows].reshape(-1, 1)
+        least = torch.linalg.lstsq(terms, known, rcond=1e-9, driver="gelsd")
+        found.append((least.solution[:, 0] / scale)[: len(own)].reshape(len(zeros), -1))
+    sure, said = student_quantile(pieces - 1, 1 - options.drift_chance / 2), []
+    names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    for j, seen in enumerate(shown):
+        places = seen.nonzero().flatten()
+        order = places[found[0][j, places].argsort()].tolist()
+        change, *others = (float(x[j, order[-1]] - x[j, order[0]]) if order else 0.0 for x in found)
+        if change - sure * math.sqrt((pieces - 1) * np.var(others)) > options.angle_term[1]:
+            joint = plant.joint_names[plant.joints - len(zeros) + j]
+            pair = " and ".join(names[k] for k in sorted({order[0], order[-1]}))
+            said.append(f"{joint} by {math.degrees(change):.2g} degrees between {pair}")
+    if said:
+        text = f'encoder zeros differ: {", ".join(said)} (`encoder_reference="per_recording"`)'
+        yield text, _unexplained(plant, data, torch.stack(own, -1))
 
 
 def _collect(
@@ -537,9 +597,7 @@ def changing_friction(
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
-    time = data.mean(data.time)
-    # Time starts again with each recording.
-    number = (time.diff(dim=0, prepend=time[:1]) < 0).cumsum(0).to(time)
+    time, number = data.mean(data.time), data.mean(data.number.to(data.time))
     clocks = {"during a recording": time, "from the first recording to the last": number}
     for j in range(plant.joints):
         *means, sliding = _of_sliding(plant, data, j, options)
@@ -680,6 +738,28 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         yield text, _unexplained(plant, given, part)
 
 
+def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator[tuple[str, float]]:
+    """Each joint, and all, as if recorded at the motor, before a gear of the best ratio."""
+    if not isinstance(plant, PendulumChain) or not given.tau.any():
+        return
+    first, eye = plant.first_link, np.eye(plant.joints)
+    q = convention.position_from_joint(given.q.numpy(), first)
+    rates = [convention.rate_from_joint(x.numpy(), first) for x in (given.qd, given.qdd)]
+    every = [("all positions are", eye.sum(0))] * (plant.joints > 1)
+    alone = [(f"{name}'s position is", eye[j]) for j, name in enumerate(plant.joint_names)]
+    for what, group in (*alone, *every):
+
+        def left(x: float, group: Array = group) -> float:
+            scale = np.exp(-x * group)
+            moved = (convention.rate_to_joint(rate * scale, first) for rate in rates)
+            at = torch.as_tensor(convention.position_to_joint(q * scale, first))
+            qd, qdd = map(torch.as_tensor, moved)
+            return _unexplained(plant, replace(given, q=at, qd=qd, qdd=qdd))
+
+        ratio, share = _best(left, *LOG_RATIOS, 41)
+        yield f"{what} {math.exp(ratio):.3g} times too large (of the motor, before its gear)", share
+
+
 def balanced_delay(
     plant: Plant,
     recordings: Sequence[Recording],
@@ -710,15 +790,15 @@ def _drifting_clock(
 
 
 def _best(
-    unexplained: Callable[[float], float], lowest: float, highest: float
+    unexplained: Callable[[float], float], lowest: float, highest: float, count: int = 9
 ) -> tuple[float, float]:
     """The value with the smallest unexplained share, and that share."""
     from scipy.optimize import minimize_scalar  # slow to import
 
     # The valley is as wide as a swing, so that a coarse grid finds it.
-    grid = np.linspace(lowest, highest, 9)
+    grid = np.linspace(lowest, highest, count)
     best = int(np.argmin([unexplained(x) for x in grid]))
-    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 8)])
+    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, count - 1)])
     close = 5e-4 * (highest - lowest)
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": close})
     return float(found.x), float(found.fun)
@@ -759,6 +839,32 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
     """Mean square of unexplained torque, (joint,), and the factor of the first `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
+    left, terms, weight = _equations(data, torque, extra)
+    # Friction that adds energy is excluded. A factor of either sign is the difference of two
+    # positive ones.
+    free = terms[..., : terms.shape[-1] - data.friction.shape[-1]]
+    design = torch.cat([terms, -free], -1)
+    scaled = design.reshape(-1, design.shape[-1]).numpy()
+    norm = np.linalg.norm(scaled, axis=0)
+    norm[norm == 0] = 1.0
+    rows = np.column_stack([scaled / norm, left.flatten().numpy()])
+    if not np.isfinite(rows).all():
+        return torch.full_like(weight, math.inf), math.nan
+    # The triangular factor has the same normal equations.
+    _, factor = np.linalg.qr(rows)
+    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
+    residual = weight * (left - design @ torch.as_tensor(found))
+    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
+    return residual.square().mean(0), float(factor_of_extra)
+
+
+def _equations(
+    data: _Data, torque: Tensor, extra: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Torque (block, joint) and what may explain it (block, joint, column) over a weight (joint,).
+
+    The columns are `extra`, the offsets of the drives, and friction.
+    """
     left = data.moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
@@ -767,19 +873,5 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
         own.append(-data.moving[..., None] * data.mean(extra.reshape(*data.q.shape, -1)))
     # A drive may have an offset.
     offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]
-    free = torch.cat([*own, offsets], -1)
-    # Friction that adds energy is excluded. A factor of either sign is the difference of two
-    # positive ones.
-    design = torch.cat([free, data.friction, -free], -1)
-    scaled = (design / weight[:, None]).reshape(-1, design.shape[-1]).numpy()
-    norm = np.linalg.norm(scaled, axis=0)
-    norm[norm == 0] = 1.0
-    rows = np.column_stack([scaled / norm, (left / weight).flatten().numpy()])
-    if not np.isfinite(rows).all():
-        return torch.full_like(weight, math.inf), math.nan
-    # The triangular factor has the same normal equations.
-    _, factor = np.linalg.qr(rows)
-    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
-    residual = left - design @ torch.as_tensor(found)
-    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
-    return residual.square().mean(0), float(factor_of_extra)
+    terms = torch.cat([*own, offsets, data.friction], -1)
+    return left / weight, terms / weight[:, None], weight

@@ -130,11 +130,8 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
     """Signs that units or time stamps are wrong, each with its remedy."""
     step = np.diff(time)
     pauses = gaps(time)
-    # A joint's motion cannot be observed at two samples per second.
-    slow = bool(np.median(step) >= 0.5)
-    if slow:
-        units = ("ms", "milliseconds"), ("us", "microseconds"), ("ns", "nanoseconds")
-        short, plain = units[min(2, int(math.log(2 * np.median(step), 1000)))]
+    if slow := time_unit(time):
+        short, plain, _ = slow
         yield (
             f"`time` looks like {plain}",
             f'if so, divide it, or read it with columns={{"time": "time:{short}"}}',
@@ -161,11 +158,12 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
         return
     # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and the first link of a
     # whirling chain seldom turns over. So if all joints exceed a full turn and one of them 30
-    # rad/s, they are driven wheels, or in degrees. Wrapped angles never span more than a turn.
+    # rad/s, they are driven wheels, or in degrees; wheels, if even in degrees they turn more often
+    # than a joint with stops, which is twice. Wrapped angles never span more than a turn.
     turns = np.ptp(q, axis=0).min() / (2 * np.pi)
     with np.errstate(over="ignore"):  # stamps may be arbitrarily close
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
-    if turns > 1 and speed > 30.0 and not slow:
+    if 1 < turns < math.degrees(2) and speed > 30.0 and not slow:
         yield (
             f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
             f"times, at up to {speed:.0f} rad/s)",
@@ -179,6 +177,16 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
             f"`q` of {wrapped} looks wrapped ({jumps.sum()} jumps of about a turn)",
             "if so, unwrap it with `numpy.unwrap(q, axis=0)`",
         )
+
+
+def time_unit(time: Array) -> tuple[str, str, float] | None:
+    """The unit that stamps seem to have: short, in words, per second; None if they are in s.
+
+    A joint's motion cannot be observed at two samples per second.
+    """
+    step = float(np.median(np.diff(time)))
+    units = ("ms", "milliseconds", 1e3), ("us", "microseconds", 1e6), ("ns", "nanoseconds", 1e9)
+    return units[min(2, int(math.log(2 * step, 1000)))] if step >= 0.5 else None
 
 
 def held_samples(q: Array) -> NDArray[np.intp]:

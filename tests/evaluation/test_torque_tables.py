@@ -240,6 +240,24 @@ def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
     assert _choose([law, network])[1].endswith("with no more parameters")
 
 
+@pytest.mark.parametrize("speeds", [(0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 0.6, 1.0, 2.0, 4.0)])
+def test_noise_of_repeats_chooses_no_law_of_more_coefficients(speeds: tuple[float, ...]) -> None:
+    """Few speeds do not show the shape of a curve, however often each is repeated."""
+    rng = np.random.default_rng(5)
+    # A drive holds a speed within a per mille.
+    qd = np.repeat(speeds, 5) * (1 + 1e-3 * rng.standard_normal(5 * len(speeds)))
+    tau = 1.0 + 0.2 * qd + 0.05 * rng.standard_normal(len(qd))
+    found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "coulomb-viscous,arctan,stribeck")
+    assert found.chosen["joint1"] == "CVFM"
+    hidden = "too few speeds to show the shape of arctan, stribeck" in found.summary()
+    assert hidden == (len(speeds) < 5)
+    peak = fit_torque(
+        pd.DataFrame({"qd": qd, "tau": tau + 0.5 * np.exp(-((qd / 0.4) ** 2))}),
+        "coulomb-viscous,stribeck",
+    )
+    assert peak.chosen["joint1"] == ("CVFM" if hidden else "Stribeck")
+
+
 def test_memory_and_load_have_to_gain_more_than_the_blocks_scatter() -> None:
     plain = Candidate("CVFM", (1.0, 1.2, 0.8, 1.1, 0.9, 2.0), 2, True)
     # A single block gains.

@@ -273,6 +273,8 @@ def test_a_torque_held_for_long_steps_is_no_delay():
         ("driven", lambda q: q + np.array([0, math.pi]), "joint2's position is 180 degrees off"),
         ("driven", lambda q: later(q, 10), "positions are recorded 2"),
         ("motor", np.degrees, "positions are in degrees"),
+        ("motor", lambda q: 5 * q, "too large (of the motor, before its gear)"),
+        ("driven", lambda q: 50 * q, "all positions are 50 times"),
         ("axis", lambda q: 1e3 * q, "positions are in mm"),
     ],
 )  # fmt: skip
@@ -382,6 +384,16 @@ def test_mistakes_in_conventions_and_time(name):
     assert "angles are absolute, not relative" in first
     with pytest.warns(UserWarning, match="milliseconds"):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
+
+
+@pytest.mark.parametrize("name", ["free", "motor", "axis"])
+@pytest.mark.parametrize(("unit", "rate"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_of_times_in_another_unit_the_unit_alone_is_named(name, unit, rate):
+    """An inertia or torque that is wrong by the square of the factor would explain as much."""
+    plant, q, tau = measured(name)
+    with pytest.warns(UserWarning, match="`time` looks like"):
+        first = warnings_of(plant, q, tau, time=rate * STEP * np.arange(len(q)))[0]
+    assert first.startswith(f"A mistake in data or rig is likely: time is in {unit}. ")
 
 
 def test_exchanged_columns_are_named():
@@ -559,7 +571,24 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
     assert task.per_recording
     assert not task.mistakes
     shared = prepare_task(CVFM(2), plant, recordings, FitOptions(encoder_reference="shared"))
-    assert "from another rig" in shared.mistakes[0]
+    assert re.search("zeros differ: .* 1.7 degrees .* 2.9 degrees .*per_rec", shared.mistakes[0])
+
+
+@pytest.mark.parametrize("degrees", [(3.0, 0.0), (0.0, 3.0), (0.0, 0.0)])
+def test_an_encoder_that_was_homed_anew_is_named(degrees):
+    """Also if friction is most of the torque, so that less than half is left over."""
+    plant = PendulumChain(**DOUBLE)
+    model = CVFM(2, [[0.02, 0.004], [0.008, 0.003]], v_smooth=0.01).requires_grad_(False)
+    starts = (1.2, -0.5), (0.9, 0.7)
+    recordings = [swing(plant, model, start=start, seconds=6.0) for start in starts]
+    q = recordings[1].q + np.radians(degrees)
+    recordings[1] = recordings[1]._replace(q=q, name="after")
+    task = prepare_task(CVFM(2), plant, recordings, FitOptions())
+    joints = [x for x, off in zip(plant.joint_names, degrees, strict=True) if off]
+    assert len(task.mistakes) == len(joints)
+    for found, joint in zip(task.mistakes, joints, strict=True):
+        assert re.match(rf"encoder zeros differ: {joint} by (2\.9|3|3\.1) degrees", found)
+        assert "and after (`encoder_reference" in found
 
 
 @pytest.mark.parametrize("rounded", [True, False])
