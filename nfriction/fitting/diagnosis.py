@@ -751,9 +751,8 @@ def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator
 
         def left(x: float, group: Array = group) -> float:
             scale = np.exp(-x * group)
-            moved = (convention.rate_to_joint(rate * scale, first) for rate in rates)
             at = torch.as_tensor(convention.position_to_joint(q * scale, first))
-            qd, qdd = map(torch.as_tensor, moved)
+            qd, qdd = (torch.as_tensor(convention.rate_to_joint(r * scale, first)) for r in rates)
             return _unexplained(plant, replace(given, q=at, qd=qd, qdd=qdd))
 
         ratio, share = _best(left, *LOG_RATIOS, 41)

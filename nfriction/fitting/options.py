@@ -159,8 +159,7 @@ class FitOptions:
     # Chance that scatter counts as a gain on hold-out windows: one standard error, because priors
     # keep a network near its law, and the evidence has judged further inputs before.
     gain_chance: float = 0.16
-    # The same for an input in fits of torque tables, which no evidence has judged before, and for a
-    # loss on hold-out data that overrules a gain on others.
+    # The same where no evidence has judged before, and to overrule a gain on other hold-out data.
     input_chance: float = 0.05
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)

@@ -128,21 +128,19 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
-    names = [gain.name for gain in chosen]
     model = copy.deepcopy(task.model)
-    cast("NeuroFuzzyModel", model).see(names)
+    cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     rival = _Contest(replace(seeing, model=model), start)
     new, old, chance = rival.validation, plain.validation, task.options.input_chance
     # An input may show only in the network: the law alone need not gain.
-    if gains(old.of_law, new.of_law, chance):
-        return (), plain
-    if new.several and gains(old.of_law_apart, new.of_law_apart, chance):
+    worse = gains(old.of_law, new.of_law, chance)
+    if worse or (new.several and gains(old.of_law_apart, new.of_law_apart, chance)):
         return (), plain
     rival.train()
-    if not gains(rival.squares, plain.squares, least=task.options.explained_ratio):
-        return (), plain
+    better = gains(rival.squares, plain.squares, least=task.options.explained_ratio)
     # Friction of the constant law may drive a joint even if that of its network does not.
-    return ((), plain) if inputs.drives(rival.found, len(task.model.law.names)) else (chosen, rival)
+    drives = inputs.drives(rival.found, len(task.model.law.names))
+    return (chosen, rival) if better and not drives else ((), plain)
 
 
 class _Contest:
