@@ -335,7 +335,7 @@ def fit_torque(
         shown = _shown(given.joints[k], of)
         name, why = _choose(shown)
         hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
-        why += f"; too few speeds to show the shape of {hidden}" * bool(hidden)
+        why += f"; measure at more speeds to judge {hidden}" * bool(hidden)
         choices[joint] = name, f"{why}{fits[name][k].note}"
         remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
     given = replace(given, remarks=tuple(remarks))
@@ -376,7 +376,7 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
 
 
 def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Models whose law has no more coefficients than the joint has speeds; all if none has.
+    """Models whose law has fewer fitted coefficients than the joint has speeds; all if none has.
 
     Any other passes through the mean torque of every speed, and repeats show only the noise.
     """
@@ -384,9 +384,13 @@ def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Cand
     for speed in np.sort(np.abs(joint.qd)).tolist():
         if speed > (1 + SAME_SPEED) * last:
             count, last = count + 1, speed
-    laws = {c: model_by_name(c.name).definition for c in candidates}
-    # The deflections of a law with memory follow the motion, not its speeds.
-    found = [c for c, law in laws.items() if law.memory or len(law.coefficients) <= count]
+    found = []
+    for candidate in candidates:
+        model = model_by_name(candidate.name)(1)
+        # Laws with a memory or a load do not depend on the speed alone.
+        more = model.law.memory or torque_table.reads_load(model)
+        if more or sum(c.fitted for c in model.law.coefficients) < count:
+            found.append(candidate)
     return found or candidates
 
 

@@ -63,7 +63,7 @@ class Mistake:
 class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
 
-    `time` counts from the start of a recording [s], (sample, 1).
+    `time` counts from the start of a recording [s], (sample, 1), and `number` the recordings.
     """
 
     q: Tensor
@@ -71,6 +71,7 @@ class _Data:
     qdd: Tensor
     tau: Tensor
     time: Tensor
+    number: Tensor
     block: int
 
     def mean(self, values: Tensor) -> Tensor:
@@ -80,11 +81,6 @@ class _Data:
     def needed(self, plant: Plant) -> Tensor:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
-
-    @cached_property
-    def number(self) -> Tensor:
-        """Number of each sample's recording, (sample, 1): time starts again with each."""
-        return (self.time.diff(dim=0, prepend=self.time[:1]) < 0).cumsum(0)
 
     @cached_property
     def moving(self) -> Tensor:
@@ -132,10 +128,11 @@ def likely_mistakes(
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
     # Inertias or torques wrong by the square of a thousand would have the same effect.
-    short, _, rate = time_unit(recordings[0].time) or ("s", "seconds", 1.0)
-    share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
-    if share < stated / options.diagnosis_ratio:
-        return stated, (Mistake(f"time is in {short}", share),)
+    if unit := time_unit(recordings[0].time):
+        short, _, rate = unit
+        share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+        if share < stated / options.diagnosis_ratio:
+            return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)
@@ -259,7 +256,8 @@ def _tested(
         yield delay_in_words(delay[0]), delay[1]
         yield _drifting_clock(plant, recordings, motions, options)
         step = recordings[0].sample_time
-        for text, data in (*_saturated(plant, given), *_elastic(plant, given, step)):
+        drives = *_saturated(plant, given), *_switched_off(plant, recordings, given)
+        for text, data in (*drives, *_elastic(plant, given, step)):
             yield text, _unexplained(plant, data)
     for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)
@@ -337,6 +335,8 @@ def _unlike_zeros(
         found.append((least.solution[:, 0] / scale)[: len(own)].reshape(len(zeros), -1))
     sure, said = student_quantile(pieces - 1, 1 - options.drift_chance / 2), []
     names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    if len({*names}) < len(names):
+        names = [f"recording {k + 1}" for k in range(len(names))]
     for j, seen in enumerate(shown):
         places = seen.nonzero().flatten()
         order = places[found[0][j, places].argsort()].tolist()
@@ -346,8 +346,16 @@ def _unlike_zeros(
             pair = " and ".join(names[k] for k in sorted({order[0], order[-1]}))
             said.append(f"{joint} by {math.degrees(change):.2g} degrees between {pair}")
     if said:
-        text = f'encoder zeros differ: {", ".join(said)} (`encoder_reference="per_recording"`)'
-        yield text, _unexplained(plant, data, torch.stack(own, -1))
+        remedy = '`method="output_error"`, ' * (options.method == "equation_error")
+        remedy += '`encoder_reference="per_recording"`'
+        text = f"encoder zeros differ: {', '.join(said)} ({remedy})"
+        share = _unexplained(plant, data, torch.stack(own, -1))
+        drives = torch.diag_embed(data.tau.any(0) * torch.ones_like(data.tau))
+        offsets = [(data.number == k)[..., None] * drives for k in range(len(recordings))]
+        # A torque that is constant near one position.
+        if _unexplained(plant, data, torch.cat(offsets, -1)) < options.diagnosis_tie * share:
+            text += ", or the offset of a drive or torque sensor changed between recordings"
+        yield text, share
 
 
 def _collect(
@@ -369,16 +377,18 @@ def _collect(
     stride = block * math.ceil(sum(map(len, recordings)) / most)
     parts: list[tuple[Array, ...]] = []
     # The longest delay is cut off both ends of a recording, so that every delay has the same data.
-    for recording, motion in zip(recordings, motions, strict=True):
+    for k, (recording, motion) in enumerate(zip(recordings, motions, strict=True)):
         stamps, margin = motion.time, options.edge + options.largest_delay
         inside = np.flatnonzero((stamps >= stamps[0] + margin) & (stamps <= stamps[-1] - margin))
         starts = np.arange(0, max(0, len(inside) - block + 1), stride)
         at = inside[(starts[:, None] + np.arange(block)).ravel()]
         since = stamps[at] - stamps[0]
         torque = recording.torque_at(stamps[at] + delay + drift * since)
-        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], torque, since[:, None]))
-    q, qd, qdd, tau, time = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    return _Data(q, qd, qdd, tau, time, block)
+        of = since[:, None], np.full((len(at), 1), k)
+        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], torque, *of))
+    found = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
+    q, qd, qdd, tau, time, number = found
+    return _Data(q, qd, qdd, tau, time, number, block)
 
 
 def _corrected_positions(
@@ -554,6 +564,42 @@ def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
             "is recorded as commanded (clip the column there)"
         )
         yield text, limited(limit)
+
+
+def _switched_off(
+    plant: Plant, recordings: Sequence[Recording], given: _Data
+) -> Iterator[tuple[str, _Data]]:
+    """Each drive, and all, off during a piece of recordings: in each where that explains most."""
+    needed, driven = given.mean(given.needed(plant)), given.mean(given.tau)
+    number, time = given.mean(given.number.to(given.q))[:, 0], given.mean(given.time)[:, 0]
+    gains, joints = torch.zeros_like(needed), np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    for j in joints:
+        shapes, left = given.friction[:, j], given.moving[:, j] * (driven - needed)[:, j]
+        left = left - shapes @ (torch.linalg.pinv(shapes) @ left)
+        without = left - given.moving[:, j] * driven[:, j]
+        gains[:, j] = (left.square() - without.square()) / driven[:, j].square().mean()
+    groups = [(f"the drive of {plant.joint_names[j]} is", [j]) for j in joints]
+    groups += [("all drives are", joints)] * (len(joints) > 1)
+    for what, own in groups:
+        found = []
+        for k, recording in enumerate(recordings):
+            blocks = (number == k).nonzero().flatten()
+            # The consecutive blocks with the largest sum.
+            total = np.append(0.0, gains[blocks][:, own].sum(1).cumsum(0).numpy())
+            rise = total - np.minimum.accumulate(total)
+            end = int(rise.argmax())
+            piece = blocks[int(total[: end + 1].argmin()) : end]
+            found.append((float(rise[end]), piece, recording.name or f"recording {k + 1}"))
+        most = max(gain for gain, *_ in found)
+        tau, said = given.tau.reshape(-1, given.block, plant.joints).clone(), []
+        for gain, piece, name in found:
+            if gain > 0.5 * most:
+                for j in own:
+                    tau[piece, :, j] = 0.0
+                said.append(f"from {time[piece[0]]:.3g} to {time[piece[-1]]:.3g} s of {name}")
+        if said:
+            text = f"{what} off {', '.join(said[:3])}, although a torque is recorded (set it to 0)"
+            yield text, replace(given, tau=tau.reshape_as(given.tau))
 
 
 def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:

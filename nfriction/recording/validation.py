@@ -182,11 +182,11 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
 def time_unit(time: Array) -> tuple[str, str, float] | None:
     """The unit that stamps seem to have: short, in words, per second; None if they are in s.
 
-    A joint's motion cannot be observed at two samples per second.
+    A joint's motion cannot be observed at two samples per second. Logs have 15 to 15,000.
     """
     step = float(np.median(np.diff(time)))
     units = ("ms", "milliseconds", 1e3), ("us", "microseconds", 1e6), ("ns", "nanoseconds", 1e9)
-    return units[min(2, int(math.log(2 * step, 1000)))] if step >= 0.5 else None
+    return units[min(2, int(math.log(15 * step, 1000)))] if step >= 0.5 else None
 
 
 def held_samples(q: Array) -> NDArray[np.intp]:

@@ -249,7 +249,7 @@ def test_noise_of_repeats_chooses_no_law_of_more_coefficients(speeds: tuple[floa
     tau = 1.0 + 0.2 * qd + 0.05 * rng.standard_normal(len(qd))
     found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "coulomb-viscous,arctan,stribeck")
     assert found.chosen["joint1"] == "CVFM"
-    hidden = "too few speeds to show the shape of arctan, stribeck" in found.summary()
+    hidden = "measure at more speeds to judge arctan, stribeck" in found.summary()
     assert hidden == (len(speeds) < 5)
     peak = fit_torque(
         pd.DataFrame({"qd": qd, "tau": tau + 0.5 * np.exp(-((qd / 0.4) ** 2))}),

@@ -27,6 +27,7 @@ from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
 from nfriction.fitting.task import prepare_task
+from nfriction.recording.validation import time_unit
 from nfriction.signals import kalman_smoother, quantise
 from tests.evaluation.test_score import zeroed_in_a_pose
 from tests.fitting.recordings import pendulum, swing
@@ -386,6 +387,16 @@ def test_mistakes_in_conventions_and_time(name):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
 
+@pytest.mark.parametrize("rate", [20.0, 500.0, 4000.0, 10000.0])
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_the_unit_of_times_is_that_of_a_usual_rate(rate, unit, factor):
+    time = np.arange(100) / rate
+    assert time_unit(time) is None
+    found = time_unit(factor * time)
+    # Above 2 kHz, ms are too short to be told from s.
+    assert found is None if factor / rate < 0.5 else found[0] == unit
+
+
 @pytest.mark.parametrize("name", ["free", "motor", "axis"])
 @pytest.mark.parametrize(("unit", "rate"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_of_times_in_another_unit_the_unit_alone_is_named(name, unit, rate):
@@ -430,6 +441,25 @@ def test_a_swing_that_gains_little_energy_is_named(backwards):
     named = [text for text in found.mistakes if "time runs backwards" in text]
     assert bool(named) == backwards
     assert (found.usability[0] == "do not use") == backwards
+
+
+@pytest.mark.parametrize("off", [slice(SAMPLES // 2, None), slice(SAMPLES // 3, 2 * SAMPLES // 3)])
+def test_a_drive_that_is_off_for_a_while_is_named(off):
+    """An emergency stop, for example, after which the log holds the command."""
+    plant, _, commanded = measured("motor")
+    driven = commanded.copy()
+    driven[off] = 0.0
+    start = torch.tensor([math.pi], dtype=torch.float64)
+    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
+    found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
+                    substeps=8, tau=torch.as_tensor(driven[:-1]))  # fmt: skip
+    q = COUNT * np.round(found.q.numpy() / COUNT)
+    assert warnings_of(plant, q, driven) == ()
+    (warning,) = warnings_of(plant, q, commanded)
+    first = STEP * off.start
+    said = float(re.search(r"the drive of joint1 is off from ([\d.]+) to ", warning)[1])
+    assert said == pytest.approx(first, abs=0.2)
+    assert "although a torque is recorded (set it to 0)" in warning
 
 
 def test_a_drive_that_saturates_is_named():
@@ -589,6 +619,26 @@ def test_an_encoder_that_was_homed_anew_is_named(degrees):
     for found, joint in zip(task.mistakes, joints, strict=True):
         assert re.match(rf"encoder zeros differ: {joint} by (2\.9|3|3\.1) degrees", found)
         assert "and after (`encoder_reference" in found
+    # A recording too short to be looked at does not shift the names; the option needs this method.
+    short = recordings[0][: round(0.1 / recordings[0].sample_time)]._replace(name="short")
+    for given in ([recordings[0], short, recordings[1]], [short, *recordings]):
+        options = FitOptions(method="equation_error")
+        for found in prepare_task(CVFM(2), plant, given, options).mistakes:
+            assert "short" not in found
+            assert found.endswith('(`method="output_error"`, `encoder_reference="per_recording"`)')
+
+
+def test_another_offset_of_a_drive_may_look_like_another_zero():
+    plant, q, tau = measured("motor")
+    halves = []
+    for part, offset in ((slice(SAMPLES // 2), 0.0), (slice(SAMPLES // 2, None), 0.3)):
+        time = STEP * np.arange(len(q[part]))
+        halves.append(
+            Recording(time, q[part], tau=tau[part] + offset, convention="relative,upright")
+        )
+    (found,) = prepare_task(CVFM(1), plant, halves, FitOptions()).mistakes
+    assert found.startswith("encoder zeros differ: joint1 by ")
+    assert found.endswith("or the offset of a drive or torque sensor changed between recordings")
 
 
 @pytest.mark.parametrize("rounded", [True, False])
