@@ -158,17 +158,16 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
         return
     # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and the first link of a
     # whirling chain seldom turns over. So if all joints exceed a full turn and one of them 30
-    # rad/s, they are driven wheels, or in degrees; wheels, if even in degrees they turn more often
-    # than a joint with stops, which is twice. Wrapped angles never span more than a turn.
+    # rad/s, they are driven wheels, or in degrees. Wrapped angles never span more than a turn.
     turns = np.ptp(q, axis=0).min() / (2 * np.pi)
     with np.errstate(over="ignore"):  # stamps may be arbitrarily close
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
-    if 1 < turns < math.degrees(2) and speed > 30.0 and not slow:
+    if turns > 1 and speed > 30.0 and not slow:
         yield (
             f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
             f"times, at up to {speed:.0f} rad/s)",
             "if so, read it with `degrees=True`, or state the counts per turn, as in "
-            'columns={"q1": "q1:counts/8192"}',
+            'columns={"q1": "q1:counts/8192"}; a wheel in radians with columns={"q1": "q1:rad"}',
         )
     jumps = turns_between_samples(q, pauses)
     if jumps.any():
