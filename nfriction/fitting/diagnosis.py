@@ -152,7 +152,7 @@ def likely_mistakes(
         unlike = [*_unlike_zeros(plant, recordings, given, options)]
         most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
-    # Near one position, a spring is like gravity, and a ratio may be that of units: simpler causes.
+    # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
     rare = *_springs(plant, given), *_geared(plant, convention, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
@@ -313,8 +313,8 @@ def _unlike_zeros(
 ) -> Iterator[tuple[str, float]]:
     """Joints whose encoder zero differs between recordings, and the share left with own zeros.
 
-    By more than a zero is usually off, because a wrong law looks like a small difference, and by
-    more than the scatter of its estimates with each piece of the data left out.
+    The difference must exceed the usual error of a zero, because a wrong law causes small ones, and
+    the scatter of its estimates with each piece of the data left out.
     """
     pieces, blocks = options.drift_pieces * len(recordings), len(data.q) // data.block
     zeros, rig = _torques_of_terms(plant, data, options)
@@ -569,7 +569,7 @@ def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
 def _switched_off(
     plant: Plant, recordings: Sequence[Recording], given: _Data
 ) -> Iterator[tuple[str, _Data]]:
-    """Each drive, and all, off during a piece of recordings: in each where that explains most."""
+    """Each drive, and all together, switched off during the piece where that explains most."""
     needed, driven = given.mean(given.needed(plant)), given.mean(given.tau)
     number, time = given.mean(given.number.to(given.q))[:, 0], given.mean(given.time)[:, 0]
     gains, joints = torch.zeros_like(needed), np.flatnonzero(given.tau.abs().amax(0)).tolist()

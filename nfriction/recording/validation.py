@@ -167,7 +167,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
             f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
             f"times, at up to {speed:.0f} rad/s)",
             "if so, read it with `degrees=True`, or state the counts per turn, as in "
-            'columns={"q1": "q1:counts/8192"}; a wheel in radians with columns={"q1": "q1:rad"}',
+            'columns={"q1": "q1:counts/8192"}, or radians with columns={"q1": "q1:rad"}',
         )
     jumps = turns_between_samples(q, pauses)
     if jumps.any():
@@ -181,7 +181,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
 def time_unit(time: Array) -> tuple[str, str, float] | None:
     """The unit that stamps seem to have: short, in words, per second; None if they are in s.
 
-    A joint's motion cannot be observed at two samples per second. Logs have 15 to 15,000.
+    A joint's motion cannot be observed at two samples per second; logs have 15 to 15,000.
     """
     step = float(np.median(np.diff(time)))
     units = ("ms", "milliseconds", 1e3), ("us", "microseconds", 1e6), ("ns", "nanoseconds", 1e9)

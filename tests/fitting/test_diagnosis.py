@@ -443,17 +443,22 @@ def test_a_swing_that_gains_little_energy_is_named(backwards):
     assert (found.usability[0] == "do not use") == backwards
 
 
+def of_motor(plant: Plant, tau: np.ndarray) -> np.ndarray:
+    """Positions of a motor under these torques, as its encoder gives them."""
+    start = torch.tensor([math.pi], dtype=torch.float64)
+    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
+    found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
+                    substeps=8, tau=torch.as_tensor(tau[:-1]))  # fmt: skip
+    return COUNT * np.round(found.q.numpy() / COUNT)
+
+
 @pytest.mark.parametrize("off", [slice(SAMPLES // 2, None), slice(SAMPLES // 3, 2 * SAMPLES // 3)])
 def test_a_drive_that_is_off_for_a_while_is_named(off):
     """An emergency stop, for example, after which the log holds the command."""
     plant, _, commanded = measured("motor")
     driven = commanded.copy()
     driven[off] = 0.0
-    start = torch.tensor([math.pi], dtype=torch.float64)
-    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
-    found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
-                    substeps=8, tau=torch.as_tensor(driven[:-1]))  # fmt: skip
-    q = COUNT * np.round(found.q.numpy() / COUNT)
+    q = of_motor(plant, driven)
     assert warnings_of(plant, q, driven) == ()
     (warning,) = warnings_of(plant, q, commanded)
     first = STEP * off.start
@@ -469,11 +474,7 @@ def test_a_drive_that_saturates_is_named():
     commanded = np.sign(tau) * np.where(np.abs(tau) > 0.6 * most, 2 * np.abs(tau) - 0.6 * most,
                                         np.abs(tau))  # fmt: skip
     driven = np.clip(commanded, -0.6 * most, 0.6 * most)
-    start = torch.tensor([math.pi], dtype=torch.float64)
-    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
-    found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
-                    substeps=8, tau=torch.as_tensor(driven[:-1]))  # fmt: skip
-    q = COUNT * np.round(found.q.numpy() / COUNT)
+    q = of_motor(plant, driven)
     assert warnings_of(plant, q, driven) == ()
     (warning,) = warnings_of(plant, q, commanded)
     assert f"the drive of joint1 saturates at {0.6 * most:.2g}"[:-1] in warning
@@ -606,7 +607,7 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
 
 @pytest.mark.parametrize("degrees", [(3.0, 0.0), (0.0, 3.0), (0.0, 0.0)])
 def test_an_encoder_that_was_homed_anew_is_named(degrees):
-    """Also if friction is most of the torque, so that less than half is left over."""
+    """Also if friction is most of the torque, so that the correction explains less than half."""
     plant = PendulumChain(**DOUBLE)
     model = CVFM(2, [[0.02, 0.004], [0.008, 0.003]], v_smooth=0.01).requires_grad_(False)
     starts = (1.2, -0.5), (0.9, 0.7)
