@@ -10,6 +10,7 @@ from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import quantise
+from nfriction.simulation.rollout import Scheme
 
 F64 = torch.float64
 COUNTS = 8192
@@ -64,7 +65,11 @@ def driven_axis(
 
 
 def flywheel(
-    seed: int, friction: FrictionModel, counts: int = 4096, noise: float = 0.01
+    seed: int,
+    friction: FrictionModel,
+    counts: int = 4096,
+    noise: float = 0.01,
+    scheme: Scheme = "rk4",
 ) -> Recording:
     """A driven axis of 0.13 kg: smooth random force with noise, an encoder, 500 Hz."""
     random = np.random.default_rng(seed)
@@ -74,7 +79,7 @@ def flywheel(
     zero = torch.zeros(1, dtype=F64)
     out = rollout(
         LinearAxis(0.13), friction, zero, zero, torch.as_tensor(tau[:-1]), sample_time=2e-3,
-        substeps=8, gradients=False,
+        substeps=8, gradients=False, scheme=scheme,
     )  # fmt: skip
     read = tau + noise * random.standard_normal(tau.shape)
     return Recording(
