@@ -130,10 +130,6 @@ class Box:
         start, lower, upper: (parameter,); equal bounds fix a parameter.
         scale: a typical large change; in decades if logarithmic.
         logarithmic: variables searched by their logarithm, bool; they must be positive.
-
-    Raises:
-        ValueError: if bounds cross, a scale is not positive, or the start is not finite, or not
-            positive where logarithmic.
     """
 
     start: Tensor
@@ -141,17 +137,6 @@ class Box:
     upper: Tensor
     scale: Tensor
     logarithmic: Tensor
-
-    def __post_init__(self) -> None:
-        if not (self.lower <= self.upper).all():
-            raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
-        if not (torch.isfinite(self.scale) & (self.scale > 0)).all():
-            raise ValueError(f"`scale` must be positive and finite, got {self.scale.tolist()}.")
-        if not (torch.isfinite(self.start) & ((self.start > 0) | ~self.logarithmic)).all():
-            raise ValueError(
-                f"`start` must be finite, and positive where logarithmic, got "
-                f"{self.start.tolist()}."
-            )
 
     @property
     def free(self) -> Tensor:
