@@ -28,7 +28,7 @@ from nfriction.papers.control import study
 from nfriction.papers.nffem.fit_rbf import place_units
 from nfriction.papers.nffem.online import OnlineNetwork, OnlineOptions, write_online
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
-from nfriction.papers.twin.dataset import Encoder
+from nfriction.papers.twin.dataset import COUNTS
 from nfriction.plant import PendulumChain
 from nfriction.plots import style
 from nfriction.signals import Motion, SecondOrderLowPass, causal_motion
@@ -55,8 +55,8 @@ def train(argv: Sequence[str] | None) -> str:
     if given.seconds < BLOCK:
         parser.error(f"--seconds must be at least {BLOCK:g}, got {given.seconds:g}.")
     plant = study.single_link()
-    cold = study.driven_recordings(
-        plant, study.true_friction(plant), count=1, seconds=COLD_SECONDS, seed=given.seed
+    cold = study.driven_recording(
+        plant, study.true_friction(plant), seconds=COLD_SECONDS, seed=given.seed
     )
     law = fit("LFM", plant, cold, method="equation_error", fit_plant=False)
     motion, true = _warming_motion(plant, given)
@@ -128,7 +128,7 @@ def _warming_motion(
         return torch.as_tensor(values)
 
     read = study.ELECTRONICS.read(torch.cat(q).numpy())
-    seen = causal_motion(time, read, 4 * Encoder().lines, CUTOFF)
+    seen = causal_motion(time, read, COUNTS, CUTOFF)
     place, qd, qdd = lagged(read), lagged(seen.qd, 1), torch.as_tensor(seen.qdd)
     measured = lagged(tau) - plant.inverse_dynamics(place, qd, qdd)
     return (qd, qdd, plant.load(place, qd), measured), lagged(torch.cat(true))

@@ -40,7 +40,7 @@ from nfriction.papers.control.feedback import (
     still,
 )
 from nfriction.papers.control.swing_up import plan_swing_up
-from nfriction.papers.twin.dataset import SPECIFICATIONS, Encoder
+from nfriction.papers.twin.dataset import COUNTS, SPECIFICATIONS
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plant.chain import Arm
 from nfriction.plots import style
@@ -61,7 +61,7 @@ SHARES = (0.5, 0.8, 1.2)
 # The arm's motor and slip ring: dry friction (independent of and proportional to load), Stribeck's
 # rise and velocity, asymmetry, viscous friction and the velocity above which it thins. Our choice.
 ARM = (0.12, 0.03, 0.4, 0.2, 0.06, 0.05, 4.0)
-ELECTRONICS = Electronics(counts=4 * Encoder().lines, delay=1, torque_limit=20.0, torque_bits=16)
+ELECTRONICS = Electronics(counts=COUNTS, delay=1, torque_limit=20.0, torque_bits=16)
 # Weights of the arm and of each link in the linear-quadratic cost: angle and rate.
 ARM_WEIGHT, LINK_WEIGHT = (10.0, 1.0), (100.0, 1.0)
 TORQUE_NOISE = 0.1  # SD of unknown torques for the Kalman filter [N m]
@@ -113,44 +113,34 @@ def true_friction(plant: PendulumChain) -> FrictionModel:
     return model.requires_grad_(False)
 
 
-def driven_recordings(
-    plant: PendulumChain, friction: FrictionModel, *, count: int, seconds: float, seed: int = 0
-) -> list[Recording]:
-    """Recordings of the hanging rig with a random multisine torque at the arm."""
-    random = np.random.default_rng(seed)
+def driven_recording(
+    plant: PendulumChain, friction: FrictionModel, *, seconds: float, seed: int = 0
+) -> Recording:
+    """A recording of the hanging rig with a random multisine torque at the arm."""
     steps = round(seconds * 1000)
     time = np.arange(steps + 1) / 1000
-    found = []
-    for k in range(count):
-        frequency = np.geomspace(0.2, 2.0, 6)
-        phase = random.uniform(0, 2 * np.pi, len(frequency))
-        tau = np.zeros((steps + 1, plant.joints))
-        tau[:, 0] = 0.9 * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
-        # From hanging, since motion about upright would need a controller during the recording.
-        hanging = torch.zeros(plant.joints, dtype=torch.float64)
-        hanging[1] = math.pi
-        run = rollout(plant, friction, hanging, torch.zeros_like(hanging), torch.tensor(tau[:-1]),
-                      sample_time=1e-3)  # fmt: skip
-        found.append(
-            Recording(
-                time=time, q=ELECTRONICS.read(run.q.numpy()), tau=tau,
-                names=plant.joint_names, convention=AngleConvention.of("relative,upright"),
-                name=f"driven_{k + 1}",
-            )
-        )  # fmt: skip
-    return found
+    frequency = np.geomspace(0.2, 2.0, 6)
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(frequency))
+    tau = np.zeros((steps + 1, plant.joints))
+    tau[:, 0] = 0.9 * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
+    # From hanging, since motion about upright would need a controller during the recording.
+    hanging = torch.zeros(plant.joints, dtype=torch.float64)
+    hanging[1] = math.pi
+    run = rollout(plant, friction, hanging, torch.zeros_like(hanging), torch.tensor(tau[:-1]),
+                  sample_time=1e-3)  # fmt: skip
+    return Recording(
+        time=time, q=ELECTRONICS.read(run.q.numpy()), tau=tau, names=plant.joint_names,
+        convention=AngleConvention.of("relative,upright"), name="driven_1",
+    )  # fmt: skip
 
 
-def fitted_model(
-    plant: PendulumChain, recordings: Sequence[Recording], name: str, max_steps: int = 3
-) -> FrictionModel:
-    """A model fitted to driven recordings: constants by equation error, others on windows."""
+def fitted_model(plant: PendulumChain, recording: Recording, name: str) -> FrictionModel:
+    """A model fitted to a driven recording: constants by equation error, others on windows."""
     model = model_by_name(name)(plant.joints)
     method: Method = "output_error" if model.schedule.follows_motion else "equation_error"
     return fit(
-        model, plant, recordings, method=method, windows=WINDOWS, max_steps=max_steps,
-        fit_plant=False,
-    ).model  # fmt: skip
+        model, plant, recording, method=method, windows=WINDOWS, max_steps=3, fit_plant=False
+    ).model
 
 
 def compensation_of(model: FrictionModel) -> Compensation:
@@ -187,7 +177,7 @@ def reference(time: float) -> tuple[float, float]:
 def weights(joints: int) -> Weights:
     """Weights of regulator and Kalman filter; the encoder noise is that of counts."""
     state = np.array([ARM_WEIGHT, *[LINK_WEIGHT] * (joints - 1)]).T.reshape(-1)
-    return Weights(state, TORQUE_NOISE, 2.0 * math.pi / (4 * Encoder().lines) / math.sqrt(12.0))
+    return Weights(state, TORQUE_NOISE, 2.0 * math.pi / COUNTS / math.sqrt(12.0))
 
 
 def top_gains(plant: PendulumChain) -> Gains:

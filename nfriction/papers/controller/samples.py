@@ -18,7 +18,7 @@ from torch import Tensor
 from nfriction.io.files import parse_json, write_atomically
 from nfriction.io.formats import write_table
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
-from nfriction.papers.twin.dataset import Encoder, make
+from nfriction.papers.twin.dataset import COUNTS, make
 from nfriction.signals import Motion, causal_motion
 
 INPUTS = ("speed", "acceleration")
@@ -87,36 +87,32 @@ def sampled(
     return ControllerSamples(tuple(joint_names), names.pop(), motion.time[::every].copy(), x, y)
 
 
-def make_samples(*, seed: int = 0, duration: float | None = None) -> ControllerSamples:
-    """The papers' controllers along the measured friction experiment of the TLRIP twin.
+def build_samples(
+    out: str | os.PathLike[str], *, seed: int = 0, duration: float | None = None
+) -> ControllerSamples:
+    """Sample the papers' controllers along the measured friction experiment of the TLRIP twin.
 
     40 s at 1 kHz give 40,000 samples per joint. Velocity and acceleration are computed from the
     encoders by the causal filters of a real-time controller.
 
     Args:
+        out: folder to which `<joint>.csv.gz` for every joint and `checksums.json` are written.
         seed: for the encoders' errors.
         duration: of the experiment [s]; by default 40.
+
+    Returns:
+        The samples as stored in the files, with nine digits.
 
     References:
         TLRIP paper, Tables 4 and 5, and the training of the 2-10-2 networks.
     """
-    made = make("experiment", seed=seed, duration=duration)
-    (recording,) = made.recordings.values()
-    joint = recording.joint_coordinates(made.plant)
-    motion = causal_motion(joint.time, joint.q, 4 * Encoder().lines)
+    twin = make("experiment", seed=seed, duration=duration)
+    (recording,) = twin.recordings.values()
+    recorded = recording.joint_coordinates(twin.plant)
+    motion = causal_motion(recorded.time, recorded.q, COUNTS)
     controllers = [paper_controller(number) for number in (2, 3, 4)]
-    return sampled(controllers, motion, joint_names=made.plant.joint_names)
-
-
-def build_samples(
-    out: str | os.PathLike[str], *, seed: int = 0, duration: float | None = None
-) -> ControllerSamples:
-    """Write `<joint>.csv.gz` for every joint and `checksums.json`; see `make_samples`.
-
-    Returns:
-        The samples as stored in the files, with nine digits.
-    """
-    folder, made = Path(out), make_samples(seed=seed, duration=duration)
+    made = sampled(controllers, motion, joint_names=twin.plant.joint_names)
+    folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CHECKSUMS).unlink(missing_ok=True)  # of an earlier build
     for joint, name in enumerate(made.joint_names):

@@ -42,6 +42,7 @@ from nfriction.papers.reproduction.workspace import (
     Workspace,
     smoothed,
 )
+from nfriction.papers.twin.dataset import COUNTS
 from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
@@ -61,8 +62,6 @@ SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pat
 """The second paper's method for each model."""
 EXPERIMENT = "experiment"
 """Twin of the TLRIP paper's friction experiment, whose classes are given in its Table 6."""
-COUNTS = 8192
-"""Counts per revolution of the papers' encoders, four edges for each of 2048 lines."""
 
 
 class Stage(NamedTuple):
@@ -324,12 +323,10 @@ def controlled(workspace: Workspace, name: str) -> dict[str, Any]:
     settings = workspace.settings
     fitted: list[dict[str, FrictionModel]] = []
     for rig, plant in (("one", study.single_link()), ("three", rigs.rtip("free"))):
-        recordings = study.driven_recordings(
-            plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
+        recording = study.driven_recording(
+            plant, study.true_friction(plant), seconds=12.0, seed=settings.seed
         )
-        fitted.append(
-            {n: study.fitted_model(plant, recordings, n) for n in settings.control_models}
-        )
+        fitted.append({n: study.fitted_model(plant, recording, n) for n in settings.control_models})
         for label, model in fitted[-1].items():
             save(model, workspace.model(f"{name}-{rig}-{label}"))
     tables, motions = study.run_study(

@@ -30,6 +30,8 @@ Split = Literal["train", "test"]
 RATE = 1000  # samples per second
 JITTER = 5e-6  # standard deviation of the sampling instants [s]
 QUICK_DURATION = 10.0  # of recordings for a quick test [s]
+COUNTS = 8192
+"""Counts per revolution of the papers' encoders: four edges for each of 2048 lines."""
 # Released exactly upright, a pendulum never falls; a hand releases it about this far off [deg].
 RELEASE_ERROR = 0.1
 
@@ -145,13 +147,11 @@ class Encoder:
     """An incremental encoder; all four edges per line are counted.
 
     Attributes:
-        lines: per revolution.
         eccentricity: amplitude of the error that repeats every revolution [counts].
         phase: angle at which that error crosses zero [rad].
         edges: displacement of each of the four edges of a line [counts], within ± 0.5.
     """
 
-    lines: int = 2048
     eccentricity: float = 0.0
     phase: float = 0.0
     edges: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -159,7 +159,7 @@ class Encoder:
     @property
     def quantum(self) -> float:
         """Angle of one count [rad]."""
-        return math.tau / (4 * self.lines)
+        return math.tau / COUNTS
 
     @classmethod
     def drawn(cls, random: np.random.Generator) -> Encoder:
