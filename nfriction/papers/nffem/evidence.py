@@ -116,7 +116,6 @@ class EvidenceResult:
         log_evidence: in nats, with all constants, so models of the same data can be compared.
         covariance: posterior covariance of the parameters, shape (p, p).
         steps: accepted steps.
-        history: log evidence before each step.
     """
 
     status: Status
@@ -130,7 +129,6 @@ class EvidenceResult:
     log_evidence: float
     covariance: Tensor
     steps: int
-    history: list[float]
 
     @property
     def converged(self) -> bool:
@@ -150,7 +148,7 @@ def bayesian_regularisation(
     *,
     kind: Callable[[str], str] = str,
     prior: Mapping[str, Tensor | float] | None = None,
-    options: EvidenceOptions | None = None,
+    options: EvidenceOptions = EvidenceOptions(),
 ) -> EvidenceResult:
     """Train a module in place on samples, with Bayesian regularisation and no validation set.
 
@@ -174,7 +172,6 @@ def bayesian_regularisation(
     Raises:
         ValueError: if samples or prior do not match the model.
     """
-    options = EvidenceOptions() if options is None else options
     parameters, given = trainable(model), prior or {}
     if not parameters or (unknown := sorted(set(given) - set(parameters))):
         wrong = f"`prior` names {unknown}" if parameters else "`model` has nothing to train"
@@ -229,7 +226,6 @@ class _Fit:
         nan = torch.full_like(w, math.nan)
         self.state = EvidenceState(w, nan.new_full((len(prior.names),), math.nan))
         self.local = NormalEquations(nan.diag(), nan, nan.sum())
-        self.history: list[float] = []
         self.not_finite = False
 
     def run(self) -> Status:
@@ -244,7 +240,6 @@ class _Fit:
         ) as bar:  # fmt: skip
             while True:
                 known = self.posterior()
-                self.history.append(known.log_evidence)
                 if self._settled(known):
                     return "converged"
                 unexplained = self.samples - float(known.gamma.sum())
@@ -263,7 +258,7 @@ class _Fit:
                 failed = self._advance()
                 if failed is not None:
                     return failed
-                bar.set_postfix(log_evidence=f"{self.history[-1]:.6g}", refresh=False)
+                bar.set_postfix(log_evidence=f"{known.log_evidence:.6g}", refresh=False)
                 bar.update()
                 if callback is not None and callback(self.state):
                     return "stopped"
@@ -371,7 +366,6 @@ class _Fit:
             log_evidence=known.log_evidence,
             covariance=known.covariance,
             steps=state.step,
-            history=self.history,
         )
 
 
