@@ -103,7 +103,7 @@ def _bench(given: argparse.Namespace) -> Bench:
         return Bench(made.plant, train, test, motions, made.initial_states)
     if given.rig is None:
         raise ValueError("recordings need --rig, a rig file or the name of one.")
-    plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
+    plant = rigs.of(given.rig)
     convention = AngleConvention.of(given.angles or plant)
     unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
     train = [
@@ -128,7 +128,7 @@ def write(
     path = save(model, given.out / f"{name}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     lines = [f"{name}: {info.fit.get('status', 'made')}"]
-    for split, recording, _ in bench.parts():
+    for split, recording in bench.parts():
         state = bench.states.get(recording.name)
         found = score(plant, model, recording, initial_state=state, limit=False)
         joints = ", ".join(f"{1e3 * e:.4g}" for e in found.free_run.joints)

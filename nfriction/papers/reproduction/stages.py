@@ -371,7 +371,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
     """
     scores: dict[str, Any] = {}
     simulated: dict[str, Array] = {}
-    for split, recording, _ in bench.parts():
+    for split, recording in bench.parts():
         name, state = recording.name, bench.states[recording.name]
         found = score(bench.plant, model, recording, initial_state=state, limit=False)
         driven = found.simulated

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -21,9 +20,9 @@ from nfriction.io.files import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.papers.control import study
-from nfriction.papers.twin.dataset import Split
-from nfriction.plant import Plant, rigs
-from nfriction.recording import Recording, read_initial_states
+from nfriction.papers.twin.dataset import Split, read
+from nfriction.plant import Plant
+from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.version import __version__
 
@@ -118,13 +117,9 @@ class Bench:
         """Motions of the recordings in `train`."""
         return self.motions[: len(self.train)]
 
-    def parts(self) -> list[tuple[Split, Recording, Motion]]:
-        """Every recording with its split and its motion."""
-        splits: tuple[tuple[Split, list[Recording]], ...] = (
-            ("train", self.train), ("test", self.test)
-        )  # fmt: skip
-        motions = iter(self.motions)
-        return [(split, r, next(motions)) for split, part in splits for r in part]
+    def parts(self) -> list[tuple[Split, Recording]]:
+        """Every recording with its split."""
+        return [*(("train", r) for r in self.train), *(("test", r) for r in self.test)]
 
 
 def smoothed(plant: Plant, recordings: Sequence[Recording]) -> list[Motion]:
@@ -248,20 +243,13 @@ class Workspace:
 
     def bench(self, twin: str) -> Bench:
         """A finished twin."""
-        folder = self.folder / "twin" / twin
-        plant = rigs.read(folder / "rig.json")
-        convention = ",".join(plant.convention)
-        parts: dict[str, list[Recording]] = {"train": [], "test": []}
-        for row in pd.read_csv(folder / "recordings.csv", dtype=str).to_dict("records"):
-            parts[row["split"]].append(Recording.read(folder / row["file"], convention=convention))
-        kept = self.arrays(f"twin-{twin}")
+        made, kept = read(twin, self.folder / "twin" / twin), self.arrays(f"twin-{twin}")
+        train, test = made.part("train"), made.part("test")
         motions = [
             Motion(r.time, kept[f"{r.name}_q"], kept[f"{r.name}_qd"], kept[f"{r.name}_qdd"])
-            for r in (*parts["train"], *parts["test"])
+            for r in (*train, *test)
         ]
-        # Only twins have exact initial states.
-        states = read_initial_states(folder / "recordings.csv")
-        return Bench(plant, parts["train"], parts["test"], motions, states)
+        return Bench(made.plant, train, test, motions, made.initial_states)
 
     def _file(self, stage: str, suffix: str) -> Path:
         return self.folder / "stages" / f"{stage}.{suffix}"
