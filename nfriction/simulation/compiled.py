@@ -96,12 +96,10 @@ def integrate_compiled(
 
 
 def _compiled(
-    system: System, backend: Backend, step_function: StepFunction = rk4_step
+    system: System, backend: Backend, step_function: StepFunction
 ) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this system, from the cache if it is there."""
     plant, friction = system.plant, system.friction
-    if backend == "torch":
-        return None
     if not all(isinstance(m, nn.Module) for m in (plant, friction)):
         if backend == "auto":
             return None
