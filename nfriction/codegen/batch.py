@@ -1,7 +1,7 @@
 """Batches: arguments in the form that compiled code reads, and code that loops over rows."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,8 +12,10 @@ import numpy as np
 from torch import Tensor
 
 from nfriction.codegen import jit
+from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule
 from nfriction.codegen.ir import Body
+from nfriction.codegen.scalar import Node
 
 Array = np.ndarray
 
@@ -136,10 +138,18 @@ class Driver:
         layout: its arguments.
         width: number of rows computed together as vectors, which share all parameters; 0 for one.
         sizes: elements of each array in the workspace.
-        once: number of values computed once, with one slot each.
+        once: nodes computed once, with one slot each.
+        places: array and index of the input nodes.
     """
 
-    def __init__(self, layout: Layout, width: int, sizes: Mapping[str, int], once: int) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        width: int,
+        sizes: Mapping[str, int],
+        once: Sequence[Node],
+        places: Mapping[int, tuple[str, int]],
+    ) -> None:
         self.body = Body()
         self.layout = layout
         self.width = width
@@ -150,8 +160,21 @@ class Driver:
             self.offset[name] = self.room
             self.room += size * self.lanes
         self.offset["once"] = self.room
-        self.room += once
+        self.room += len(once)
         self.value: dict[str, str] = {}
+        write_function(self.body, "nf_once", {"once": once}, places, ["p"], [], seldom=True)
+        self._places = {**places, **{n.number: ("once", i) for i, n in enumerate(once)}}
+
+    def function(
+        self,
+        name: str,
+        inputs: Sequence[str],
+        outputs: Mapping[str, Sequence[Node]],
+        seldom: bool = False,
+    ) -> None:
+        """Write a function of workspace arrays, the parameters and the values computed once."""
+        shared = ["p", "once"]
+        write_function(self.body, name, outputs, self._places, shared, inputs, self.width, seldom)
 
     @contextmanager
     def entry(self) -> Iterator[None]:
@@ -173,6 +196,7 @@ class Driver:
                 self.value["first"] = body.let(f"add i64 %first, {ahead}")
                 own = body.let(f"mul i64 {self.value['first']}, {self.value['p_row']}")
                 self.value["own_p"] = body.at(self.value["p"], own)
+                self.call("nf_once")
                 yield
             body.run("ret void")
 
@@ -182,7 +206,7 @@ class Driver:
 
     def call(self, name: str, *arguments: str) -> None:
         """Call a function of addresses, given by their names in `value`."""
-        given = ", ".join(f"ptr {self.value[a]}" for a in arguments)
+        given = ", ".join(f"ptr {self.value[a]}" for a in ("own_p", "room.once", *arguments))
         self.body.run(f"call void @{name}({given})")
 
     def least(self, a: str, b: str) -> str:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen import batch
-from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule, Method, Program
 from nfriction.codegen.scalar import SelfCheckFailed
 from nfriction.codegen.transform import hoist, with_jacobian
@@ -144,26 +143,16 @@ def _driver(program: Program, layout: batch.Layout, width: int) -> batch.Driver:
     """A loop over rows."""
     groups, once = hoist(program.graph, [port.nodes for port in program.outputs])
     outputs = dict(zip(layout.outputs, groups, strict=True))
-    places: dict[int, tuple[str, int]] = {}
     sizes = {name: len(group) for name, group in outputs.items()}
-    parameters = 0
-    for port in program.inputs:
-        own = port.name in layout.series
-        array, offset = (port.name, 0) if own else ("p", parameters)
-        places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
-        sizes |= {port.name: len(port.nodes)} if own else {}
-        parameters += 0 if own else len(port.nodes)
-    driver = batch.Driver(layout, width, sizes, len(once))
-    write_function(driver.body, "nf_once", {"once": once}, places, ["p"], [], seldom=True)
-    places |= {node.number: ("once", i) for i, node in enumerate(once)}
-    shared = ["p", "once"]
-    write_function(driver.body, "nf_row", outputs, places, shared, layout.series, width)
+    sizes |= {p.name: len(p.nodes) for p in program.inputs if p.name in layout.series}
+    places = program.places({name: (name, 0) for name in layout.series})
+    driver = batch.Driver(layout, width, sizes, once, places)
+    driver.function("nf_row", layout.series, outputs)
     with driver.entry():
-        driver.call("nf_once", "own_p", "room.once")
         for name in layout.series:
             driver.gather(name, sizes[name], driver.value[f"room.{name}"])
         rooms = (f"room.{name}" for name in (*layout.series, *layout.outputs))
-        driver.call("nf_row", "own_p", "room.once", *rooms)
+        driver.call("nf_row", *rooms)
         for name in layout.outputs:
             driver.scatter(name, sizes[name])
     return driver

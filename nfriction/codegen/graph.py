@@ -52,6 +52,16 @@ class Program:
         ]
         return hashlib.sha256(repr((ports, nodes)).encode()).hexdigest()
 
+    def places(self, arrays: Mapping[str, tuple[str, int]]) -> dict[int, tuple[str, int]]:
+        """Array and index of each input node; inputs without an array are parameters, in `p`."""
+        found: dict[int, tuple[str, int]] = {}
+        parameters = 0
+        for port in self.inputs:
+            array, offset = arrays.get(port.name, ("p", parameters))
+            found |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
+            parameters += len(port.nodes) * (array == "p")
+        return found
+
 
 class ScalarTensor(Tensor):
     """A tensor whose elements are nodes of a scalar graph."""

@@ -1,6 +1,6 @@
 """Rollouts of a plant with friction: the traced step, the loops around it, and batches."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,6 @@ from nfriction.codegen.batch import (
     series,
     to_array,
 )
-from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule, Program
 from nfriction.codegen.ir import real
 from nfriction.codegen.scalar import Node, SelfCheckFailed
@@ -105,13 +104,7 @@ def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
     start, held, step, (within,), begin, advance = groups
     at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
           "seen_qd": ("seen", 0), "law": ("state", 3 * joints)}  # fmt: skip
-    places: dict[int, tuple[str, int]] = {}
-    parameters = 0
-    for port in program.inputs:
-        own = port.name in INPUTS
-        array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
-        places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
-        parameters += 0 if own else len(port.nodes)
+    places = program.places({name: (name, 0) for name in INPUTS} | at)
     return RolloutProgram(joints, tuple(once), start, held, step, within, begin, advance, places)
 
 
@@ -123,24 +116,14 @@ class RolloutDriver(Driver):
         sizes = {"state": len(program.step), "seen": 2 * n, "tau": n, "step": 1,
                  "held": len(program.held), "memory": len(program.advance), "within": 1,
                  "alive": 1}  # fmt: skip
-        super().__init__(LAYOUT, width, sizes, len(program.once))
+        super().__init__(LAYOUT, width, sizes, program.once, program.places)
         self.program = program
         self._functions()
         with self.entry():
             self._candidates()
 
     def _functions(self) -> None:
-        parts, body = self.program, self.body
-        known = parts.places | {n.number: ("once", i) for i, n in enumerate(parts.once)}
-
-        def function(
-            name: str, inputs: Sequence[str], outputs: dict[str, Any], seldom: bool = False
-        ) -> None:
-            shared = ["p", "once"]
-            write_function(body, name, outputs, known, shared, inputs, self.width, seldom)
-
-        once = {"once": parts.once}
-        write_function(body, "nf_once", once, parts.places, ["p"], [], seldom=True)
+        parts, function = self.program, self.function
         function("nf_start", ["state", "tau"], {"rate": parts.start}, seldom=True)
         function("nf_held", ["seen", "memory"], {"held": parts.held})
         function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
@@ -151,7 +134,6 @@ class RolloutDriver(Driver):
     def _candidates(self) -> None:
         """Write the code for candidates that are computed together."""
         body, n, value = self.body, self.program.joints, self.value
-        self.call("nf_once", "own_p", "room.once")
         self.gather("q0", n, value["room.state"])
         self.gather("qd0", n, self.element("state", n))
         self.gather("tau", n, value["room.tau"])
@@ -159,7 +141,7 @@ class RolloutDriver(Driver):
         if self.law:
             self.gather("law", self.law, self.element("state", 3 * n))
         value["rate"] = self.element("state", 2 * n)
-        self.call("nf_start", "own_p", "room.once", "room.state", "room.tau", "rate")
+        self.call("nf_start", "room.state", "room.tau", "rate")
         with self.each() as (candidate, _):
             body.store("-1", value["diverged"], candidate, "i64")
         self._record("0")
@@ -186,12 +168,12 @@ class RolloutDriver(Driver):
         if self.program.advance:
             self._remember(k)
             # A controller running at the sample rate holds its coefficients over the whole sample.
-            self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+            self.call("nf_held", "sees", "room.memory", "room.held")
         with body.loop("0", value["substeps"]):
             if not self.program.advance:
-                self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+                self.call("nf_held", "sees", "room.memory", "room.held")
             rooms = ("state", "tau", "step", "held", "within")
-            self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
+            self.call("nf_step", *(f"room.{name}" for name in rooms))
             fine = body.load(value["room.within"], 0, real(self.width))
             one = body.constant(1.0, self.width)
             lost = body.let(f"fcmp une {real(self.width)} {fine}, {one}")
@@ -208,11 +190,11 @@ class RolloutDriver(Driver):
         given = body.let(f"icmp ne i64 {self.value['remembered']}, 0")
         unknown = body.let(f"xor i1 {given}, true")
         with body.when(later):
-            self.call("nf_advance", "own_p", "room.once", "sees", "room.memory")
+            self.call("nf_advance", "sees", "room.memory")
         with body.when(body.let(f"and i1 {first}, {given}")):
             self.gather("memory", size, self.value["room.memory"])
         with body.when(body.let(f"and i1 {first}, {unknown}")):
-            self.call("nf_begin", "own_p", "room.once", "sees", "room.memory")
+            self.call("nf_begin", "sees", "room.memory")
 
     def _stop(self, k: str, alive: str) -> None:
         """Mark candidates that diverged; their simulation continues from zero, without output."""
@@ -406,14 +388,18 @@ class CompiledRollout:
         found = map(torch.from_numpy, outputs.values())
         return tuple(x.reshape(*batch, *x.shape[1:]) for x in found)
 
-    def check(self) -> None:
+    @torch.no_grad()
+    def check(self, eager: Callable[[RolloutInputs], tuple[Tensor, ...]]) -> None:
         """Compare two steps from random states with the same steps in eager torch.
+
+        Args:
+            eager: states that torch gives for inputs, as this rollout does.
 
         Raises:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         # Two steps, so that a hidden state advances once; short, so that errors show in the rate.
-        steps, dt = 2, 1e-4
+        steps, dt, size = 2, 1e-4, self._system.law_size
         generator = torch.Generator().manual_seed(1)
         scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, typical of mechanisms
         for _ in range(3):
@@ -421,31 +407,14 @@ class CompiledRollout:
                 s * torch.randn(self.joints, generator=generator, dtype=torch.float64)
                 for s in scales
             )
-            expected = to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
             step = torch.full((steps,), dt, dtype=torch.float64)
-            inputs = RolloutInputs(q, qd, tau.expand(steps, -1), step)
-            rate, eager = (self(inputs)[1][-1].numpy() - qd.numpy()) / dt, expected / dt
-            scale = _CHECK_TOLERANCE * (1.0 + np.abs(eager).max())
-            if not np.allclose(rate, eager, rtol=0.0, atol=scale, equal_nan=True):
+            law = q.new_zeros(self.joints, size) if size else None
+            inputs = RolloutInputs(q, qd, tau.expand(steps, -1), step, law_state=law)
+            rate, expected = ((f(inputs)[1][-1] - qd).numpy() / dt for f in (self, eager))
+            scale = _CHECK_TOLERANCE * (1.0 + np.abs(expected).max())
+            if not np.allclose(rate, expected, rtol=0.0, atol=scale, equal_nan=True):
                 raise SelfCheckFailed(
-                    f"compiled code accelerates by {rate} where torch gives {eager} at q={q}, "
+                    f"compiled code accelerates by {rate} where torch gives {expected} at q={q}, "
                     f"qd={qd}; please report this, and use the torch rollout "
                     '(`backend="torch"`) meanwhile.'
                 )
-
-    @torch.no_grad()
-    def _eager(self, q: Tensor, qd: Tensor, tau: Tensor, steps: int, dt: float) -> Tensor:
-        """Velocity after a number of steps in torch."""
-        q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
-        plant, friction = self._system.plant, self._system.friction
-        qdd, memory = plant.forward_dynamics(q, qd, tau), None
-        size = self._system.law_size
-        law = (q.new_zeros(self.joints, size),) if size else ()
-        for k in range(steps):
-            if not self._system.memory_size:
-                held = friction.coefficients(qd, qdd)
-            else:
-                memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)
-                held = friction.coefficients_from(qd, qdd, memory)
-            q, qd, qdd, *law = self._system.step(plant, friction, q, qd, tau, held, dt, *law)
-        return qd

@@ -115,12 +115,11 @@ def _download(address: str, path: Path) -> None:
 
 def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:
     """A table whose columns are formatted by the longest matching prefix of their names."""
-    columns = []
+    columns = {}
     for name, values in table.items():
         form = digits[max((key for key in digits if str(name).startswith(key)), key=len)]
-        columns.append([form % value for value in values])
-    lines = [",".join(table.columns), *(",".join(row) for row in zip(*columns, strict=True))]
-    return ("\n".join(lines) + "\n").encode()
+        columns[name] = [form % value for value in values]
+    return pd.DataFrame(columns).to_csv(index=False, lineterminator="\n").encode()
 
 
 def _multiarm(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:

@@ -70,17 +70,12 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
             raise WorkerDied(_cause(ended.returncode, errors.read()))
 
 
-def worker_main(
-    work: Callable[[Mapping[str, Any], Path], None],
-    *,
-    refusals: tuple[type[Exception], ...],
-    memory: int,
-) -> None:
+def worker_main(work: Callable[[Mapping[str, Any], Path], None], *, memory: int) -> None:
     """Do the task on standard input within limits of time and memory.
 
     Args:
-        work: function of the task and the folder for results.
-        refusals: its errors that concern the file; `run_isolated` raises them as `InvalidFile`.
+        work: function of the task and the folder for results. Its ValueErrors concern the file;
+            `run_isolated` raises them as `InvalidFile`.
         memory: limit of the address space [bytes]; a written file may take a quarter of it.
     """
     request = json.load(sys.stdin)
@@ -88,7 +83,7 @@ def worker_main(
     _limit(request["seconds"], memory)
     try:
         work(request["task"], folder)
-    except refusals as error:
+    except ValueError as error:
         reason = str(error)[:1000]
         (folder / _REFUSAL).write_text(reason, encoding="utf-8", errors="replace")
 

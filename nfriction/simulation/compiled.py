@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nfriction import codegen
 from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import RolloutInputs, StepFunction
-from nfriction.simulation.rk4 import rk4_step
+from nfriction.simulation.rk4 import rk4_step, simulate_eager
 
 logger = logging.getLogger(__name__)
 
@@ -96,12 +96,10 @@ def integrate_compiled(
 
 
 def _compiled(
-    system: System, backend: Backend, step_function: StepFunction = rk4_step
+    system: System, backend: Backend, step_function: StepFunction
 ) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this system, from the cache if it is there."""
     plant, friction = system.plant, system.friction
-    if backend == "torch":
-        return None
     if not all(isinstance(m, nn.Module) for m in (plant, friction)):
         if backend == "auto":
             return None
@@ -135,7 +133,7 @@ def _attempt(
         traced = codegen.CompiledRollout(plant, friction, step_function)
         found = _compiled_graphs.get(traced.digest)
         if found is None:
-            traced.check()
+            traced.check(lambda inputs: simulate_eager(plant, friction, inputs, step_function))
             found = traced
     except codegen.SelfCheckFailed:
         raise

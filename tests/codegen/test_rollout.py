@@ -9,7 +9,7 @@ from torch import nn
 
 from nfriction import codegen
 from nfriction.codegen import SelfCheckFailed, UnsupportedOperation, ir
-from nfriction.simulation.rk4 import rk4_step
+from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from tests.codegen.mechanisms import F64, Coulomb, NeuroFuzzy, Pendulum, reference
 
 # Rounding differs by an ulp or two a step; a second of a falling chain amplifies that tenfold.
@@ -39,7 +39,7 @@ def run(
 
 def compile_rollout(plant, friction, **settings):
     compiled = codegen.CompiledRollout(plant, friction, rk4_step, **settings)
-    compiled.check()
+    compiled.check(lambda inputs: simulate_eager(plant, friction, inputs))
     return compiled
 
 

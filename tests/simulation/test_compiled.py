@@ -25,9 +25,9 @@ def compilations(monkeypatch):
     """An empty cache, and a list that grows with every compilation."""
     made = []
 
-    def check(rollout):
+    def check(rollout, eager):
         made.append(rollout)
-        original(rollout)
+        original(rollout, eager)
 
     original = codegen.CompiledRollout.check
     monkeypatch.setattr(codegen.CompiledRollout, "check", check)

@@ -355,7 +355,7 @@ def main() -> None:
         read = SIGNALS_OF[task["library"]]
         save_signals(read(Path(task["path"]), task["sources"]), folder)
 
-    sandbox.worker_main(work, refusals=(ValueError,), memory=MEMORY)
+    sandbox.worker_main(work, memory=MEMORY)
 
 
 # Readers in the worker, by library.
