@@ -40,8 +40,8 @@ ALLOWED: dict[str, set[str]] = {
 # The papers' own methods are a wing: the command line, the loader of simulated data sets and the
 # papers' scripts use them, no other.
 MAY_USE_PAPERS = {"papers", "cli", "datasets"}
-# Only command lines talk to a person: the program's, and the one that scripts share.
-MAY_PRINT = ("cli/", "papers/twin/dataset.py")
+# Only the command line talks to a person.
+MAY_PRINT = "cli/"
 # TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no
 # use of it: a module elsewhere may have to.
 MAY_SCRIPT = {"export"}

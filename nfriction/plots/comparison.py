@@ -354,7 +354,7 @@ def save_all(
         path = next(p for end in ends if (p := folder / f"{stem}{end}.png") not in written)
         kept = {RUN_KEY: run} if run else {}
         figure.savefig(path, dpi=DPI, metadata=kept)
-        for ending in set(formats) - {"gif"}:
+        for ending in dict.fromkeys(f for f in formats if f != "gif"):
             figure.savefig(path.with_suffix(f".{ending}"))
             written.append(path.with_suffix(f".{ending}"))
         figure.clear()

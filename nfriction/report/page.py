@@ -20,6 +20,7 @@ from markupsafe import Markup
 
 from nfriction.evaluation import tables
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES
+from nfriction.evaluation.lead_in import DRAWS, LEAD_IN
 from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
@@ -198,6 +199,8 @@ def to_html(run: Run) -> str:
         run=run,
         run_id=run.id,
         no_friction=NO_FRICTION,
+        lead_in=LEAD_IN,
+        draws=DRAWS,
         error=error,
         info=info,
         tables={
