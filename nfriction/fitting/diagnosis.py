@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -134,6 +135,8 @@ def likely_mistakes(
         if share < stated / options.diagnosis_ratio:
             return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
+    if stops := [*_end_stops(plant, recordings, given, options)]:
+        return stated, tuple(stops)
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)
         # A torque that is held until the next sample acts up to one step late.
@@ -600,6 +603,40 @@ def _switched_off(
         if said:
             text = f"{what} off {', '.join(said[:3])}, although a torque is recorded (set it to 0)"
             yield text, replace(given, tau=tau.reshape_as(given.tau))
+
+
+def _end_stops(
+    plant: Plant, recordings: Sequence[Recording], given: _Data, options: FitOptions
+) -> Iterator[Mistake]:
+    """Driven joints held at an end of their motion against far more torque than moves them nearby.
+
+    A joint must return to the same place, because dry friction may hold it anywhere.
+    """
+    number, time = (x[:: given.block, 0].tolist() for x in (given.number, given.time))
+    torque = given.mean(given.tau - given.needed(plant))
+    names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+        q, said = given.q[:, j].reshape(-1, given.block), []
+        for side, end in ((-1, q.min()), (1, q.max())):
+            away = (end - q).abs().amax(1) / (q.max() - q.min())
+            sliding = (away < ALIKE) & (away > ALIKE**2) & (given.moving[:, j] > 0)
+            usual = torque[sliding, j].abs().quantile(0.5) if sliding.any() else math.inf
+            pushed = side * torque[:, j] > options.diagnosis_ratio * usual
+            held = ((away < ALIKE**2) & pushed).nonzero().flatten().tolist()
+            # The joint has left in between, or the recording is another one.
+            visits = held[:1] + [
+                b
+                for a, b in pairwise(held)
+                if number[a] != number[b] or bool((away[a:b] > ALIKE).any())
+            ]
+            if len(visits) > 1:
+                where = ", ".join(f"{time[k]:.3g} s of {names[number[k]]}" for k in visits[:3])
+                said.append(f"{float(end):.3g} {plant.unit} (at {where})")
+        if said:
+            yield Mistake(
+                f"{plant.joint_names[j]} runs into end stops near {' and '.join(said)}, which the "
+                "rig lacks (cut these parts off)", math.nan
+            )  # fmt: skip
 
 
 def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:

@@ -467,6 +467,32 @@ def test_a_drive_that_is_off_for_a_while_is_named(off):
     assert "although a torque is recorded (set it to 0)" in warning
 
 
+def turned(stop: float, effort: float, seed: int) -> Recording:
+    """A driven wheel of 0.02 kg m^2 between two stops [rad], from which it bounces a little."""
+    time, random, h = np.arange(5001) / 500, np.random.default_rng(seed), 1 / 5000
+    waves = zip((0.6, 0.4, 0.3), (0.3, 0.7, 1.3), random.uniform(0, 6.28, 3), strict=True)
+    torque = effort * sum(a * np.sin(2 * np.pi * f * time + phase) for a, f, phase in waves)
+    q, v, angle = 0.0, 0.0, []
+    for given in torque:
+        angle.append(q)
+        for _ in range(10):
+            free = v + h / 0.02 * given
+            v = float(np.copysign(max(0.0, abs(free) - h / 0.02 * 0.1) / (1 + h), free))
+            q += h * v
+            if abs(q) > stop and q * v > 0:
+                q, v = float(np.copysign(stop, q)), -0.2 * v
+    return Recording(time, quantise(np.array(angle)[:, None], 4096), tau=torque[:, None])
+
+
+@pytest.mark.parametrize(
+    ("stop", "effort", "ends"), [(1.0, 0.3, ["-0.998"]), (3.0, 1.0, ["-3", "3"]), (9.0, 0.3, [])]
+)
+def test_end_stops_are_named(stop, effort, ends):
+    recordings = [turned(stop, effort, seed) for seed in (1, 2)]
+    found = prepare_task("CVFM", Rotor(0.02), recordings, FitOptions()).mistakes
+    assert [re.findall(r"(\S+) rad \(at", text) for text in found] == ([ends] if ends else [])
+
+
 def test_a_drive_that_saturates_is_named():
     plant, q, tau = measured("motor")
     most = np.abs(tau).max()
