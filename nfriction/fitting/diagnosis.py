@@ -613,7 +613,9 @@ def _end_stops(
     A joint must return to the same place, because dry friction may hold it anywhere.
     """
     number, time = (x[:: given.block, 0].tolist() for x in (given.number, given.time))
-    torque = given.mean(given.tau - given.needed(plant))
+    needed, rest = given.needed(plant), torch.zeros_like(given.q)
+    torque = given.mean(given.tau - needed)
+    inertial = given.mean(needed - plant.inverse_dynamics(given.q, rest, rest)).abs()
     names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
     for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
         q, said = given.q[:, j].reshape(-1, given.block), []
@@ -621,7 +623,8 @@ def _end_stops(
             away = (end - q).abs().amax(1) / (q.max() - q.min())
             sliding = (away < ALIKE) & (away > ALIKE**2) & (given.moving[:, j] > 0)
             usual = torque[sliding, j].abs().quantile(0.5) if sliding.any() else math.inf
-            pushed = side * torque[:, j] > options.diagnosis_ratio * usual
+            # A wrong inertia shows at reversals, an end stop at rest.
+            pushed = side * torque[:, j] - inertial[:, j] > options.diagnosis_ratio * usual
             held = ((away < ALIKE**2) & pushed).nonzero().flatten().tolist()
             # The joint has left in between, or the recording is another one.
             visits = held[:1] + [

@@ -485,7 +485,8 @@ def turned(stop: float, effort: float, seed: int) -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("stop", "effort", "ends"), [(1.0, 0.3, ["-0.998"]), (3.0, 1.0, ["-3", "3"]), (9.0, 0.3, [])]
+    ("stop", "effort", "ends"),
+    [(0.5, 0.3, ["-0.5", "0.5"]), (3.0, 1.0, ["-3", "3"]), (9.0, 0.3, [])],
 )
 def test_end_stops_are_named(stop, effort, ends):
     recordings = [turned(stop, effort, seed) for seed in (1, 2)]
