@@ -399,18 +399,18 @@ class CompiledRollout:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         # Two steps, so that a hidden state advances once; short, so that errors show in the rate.
-        steps, dt, size = 2, 1e-4, self._system.law_size
+        steps, dt, size, device = 2, 1e-4, self._system.law_size, self._module.device
         generator = torch.Generator().manual_seed(1)
         scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, typical of mechanisms
         for _ in range(3):
             tau, q, qd = (
-                s * torch.randn(self.joints, generator=generator, dtype=torch.float64)
+                s * torch.randn(self.joints, generator=generator, dtype=torch.float64).to(device)
                 for s in scales
             )
-            step = torch.full((steps,), dt, dtype=torch.float64)
+            step = q.new_full((steps,), dt)
             law = q.new_zeros(self.joints, size) if size else None
             inputs = RolloutInputs(q, qd, tau.expand(steps, -1), step, law_state=law)
-            rate, expected = ((f(inputs)[1][-1] - qd).numpy() / dt for f in (self, eager))
+            rate, expected = (to_array(f(inputs)[1][-1].to(qd) - qd) / dt for f in (self, eager))
             scale = _CHECK_TOLERANCE * (1.0 + np.abs(expected).max())
             if not np.allclose(rate, expected, rtol=0.0, atol=scale, equal_nan=True):
                 raise SelfCheckFailed(
