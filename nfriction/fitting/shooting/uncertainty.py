@@ -167,8 +167,8 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
 
     If friction changes sign within a step, the integration error is less than an encoder count, but
     it is the same each time, so that averaging over samples does not remove it. On driven rigs,
-    which rest and reverse often, finer steps come with a steeper sign: a real joint does not creep
-    at rest, and its friction reverses at once.
+    which rest and reverse often, and where the steps limit how steep the smoothed sign is, finer
+    steps come with a steeper one: a real joint does not creep at rest, and reverses at once.
     """
     variables, x = problem.variables, result.x
     if problem.friction.schedule.state_size and not has_input(problem.friction.law, "heat"):
@@ -178,7 +178,7 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     free = (lower < upper).nonzero().flatten()
     finer = replace(problem, substeps=FINER * problem.substeps)
     # A free motion hardly rests, and may amplify so large a change beyond any linear response.
-    if problem.windows.tau.any():
+    if problem.windows.tau.any() or problem.substeps >= problem.options.max_substeps:
         finer = replace(finer, friction=deepcopy(problem.friction))
         finer.friction.v_smooth /= FINER
     off = _positions(finer, x) - _positions(problem, x)
