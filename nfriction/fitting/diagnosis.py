@@ -575,12 +575,12 @@ def _switched_off(
     """Each drive, and all together, switched off during the piece where that explains most."""
     needed, driven = given.mean(given.needed(plant)), given.mean(given.tau)
     number, time = given.mean(given.number.to(given.q))[:, 0], given.mean(given.time)[:, 0]
-    gains, joints = torch.zeros_like(needed), np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    gained, joints = torch.zeros_like(needed), np.flatnonzero(given.tau.abs().amax(0)).tolist()
     for j in joints:
         shapes, left = given.friction[:, j], given.moving[:, j] * (driven - needed)[:, j]
         left = left - shapes @ (torch.linalg.pinv(shapes) @ left)
         without = left - given.moving[:, j] * driven[:, j]
-        gains[:, j] = (left.square() - without.square()) / driven[:, j].square().mean()
+        gained[:, j] = (left.square() - without.square()) / driven[:, j].square().mean()
     groups = [(f"the drive of {plant.joint_names[j]} is", [j]) for j in joints]
     groups += [("all drives are", joints)] * (len(joints) > 1)
     for what, own in groups:
@@ -588,7 +588,7 @@ def _switched_off(
         for k, recording in enumerate(recordings):
             blocks = (number == k).nonzero().flatten()
             # The consecutive blocks with the largest sum.
-            total = np.append(0.0, gains[blocks][:, own].sum(1).cumsum(0).numpy())
+            total = np.append(0.0, gained[blocks][:, own].sum(1).cumsum(0).numpy())
             rise = total - np.minimum.accumulate(total)
             end = int(rise.argmax())
             piece = blocks[int(total[: end + 1].argmin()) : end]
@@ -636,10 +636,8 @@ def _end_stops(
                 where = ", ".join(f"{time[k]:.3g} s of {names[number[k]]}" for k in visits[:3])
                 said.append(f"{float(end):.3g} {plant.unit} (at {where})")
         if said:
-            yield Mistake(
-                f"{plant.joint_names[j]} runs into end stops near {' and '.join(said)}, which the "
-                "rig lacks (cut these parts off)", math.nan
-            )  # fmt: skip
+            text = f"{plant.joint_names[j]} runs into end stops near {' and '.join(said)}"
+            yield Mistake(f"{text}, which the rig lacks (cut these parts off)", math.nan)
 
 
 def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:
