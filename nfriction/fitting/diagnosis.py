@@ -908,13 +908,15 @@ def _unexplained(plant: Plant, data: _Data, extra: Tensor | None = None) -> floa
     """Share of the torque that Coulomb and viscous friction, and `extra`, do not explain [-].
 
     Root mean square over joints, relative to the sum of squares of the torques of drive, gravity
-    and inertia.
+    and inertia, without their means where a drive may have an offset.
     """
     needed, rest = data.needed(plant), torch.zeros_like(data.q)
     target = _balance(data, data.tau - needed, extra)[0]
     static = plant.inverse_dynamics(data.q, rest, rest)
-    parts = data.tau, static, needed - static
-    size = torch.stack([(data.moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
+    parts = torch.stack([data.mean(x) for x in (data.tau, static, needed - static)])
+    # The offset of a drive would explain a constant torque of any size.
+    constant = (data.moving * parts).sum(1, keepdim=True) / data.moving.sum(0).clamp_min(1)
+    size = (data.moving * (parts - data.tau.any(0) * constant)).square().mean(1).sum(0)
     return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
 
 

@@ -94,6 +94,14 @@ def test_sound_data_raise_no_alarm(name):
     assert warnings_of(*measured(name)) == ()
 
 
+def test_small_motion_near_the_vertical_is_not_at_the_horizontal():
+    """An offset of the drive would explain the constant gravity there."""
+    plant = PendulumChain(**MOTOR)
+    time = STEP * np.arange(SAMPLES)[:, None]
+    q = math.pi + 0.05 * np.sin(2 * math.pi * time)
+    assert warnings_of(plant, q, torque([1.0], 4)) == ()
+
+
 def test_a_moment_of_a_motion_names_no_mistake():
     """Corrections explain the few torques of a short recording by chance."""
     plant, model = pendulum(), LFM(2, [[2e-3, 3e-3]] * 2)
