@@ -361,8 +361,8 @@ class NeuroFuzzy(Schedule):
         return mean, sd / self.prior_sd
 
     @torch.no_grad()
-    def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives of the coefficients by the joint's own velocity and acceleration.
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        """Derivatives of the coefficients in closed form.
 
         With x the scaled inputs, u the reference plus w n, n the network's outputs at clamped x, w
         their weight, v = qd / v_max and t = tanh(v / turn) (1 where acceleration is signed):
@@ -371,75 +371,59 @@ class NeuroFuzzy(Schedule):
             dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
             dc/dqdd = dc/du du/dx_2 t / span.
         """
-        by_x = self._slopes_over_range(self.scaled(qd, qdd))
-        # The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
-        s = coefficients / self.scale
-        rounded = s * s / (s * s + self.roundness**2)
-        by_u = self.scale * torch.where(self.positive, rounded, 1.0)
-        velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
-        by_speed, by_acceleration = (by_x * by_u[..., None]).unbind(-1)
-        by_acceleration = by_acceleration / span[:, None]
-        by_qd = by_speed * (qd.sign() / velocity)[..., None]
-        if not self.along_motion:
-            return by_qd, by_acceleration
-        turned = torch.tanh(qd / velocity / self.turn)
-        turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
-        return by_qd + by_acceleration * turning[..., None], by_acceleration * turned[..., None]
-
-    def _slopes_over_range(self, scaled: Tensor) -> Tensor:
-        """Derivatives of the weighted network by its scaled inputs, (*batch, joint, output, 2)."""
-        x = scaled.clamp(0.0, 1.0)
-        beyond = scaled - x
-        by_x = self.network.input_jacobian(x.reshape(-1, self.joints, 2)).permute(3, 0, 1, 2)
-        # A clamped input no longer affects the network itself, only the weight of its output.
-        weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
-        slope = taper_slope(beyond, self.reach)
-        by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
-        by_x = by_x + self.network(x)[..., None] * slope[..., None, :]
-        return pad(by_x, [0, 0, 0, self.unvaried])
-
-    @torch.no_grad()
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         anfis, head = self.network.anfis, self.network.head
         x, weight = self._clamped_inputs(qd, qdd)
-        y = anfis(x)
+        y, beyond = anfis(x), self.scaled(qd, qdd) - x
         both = torch.cat([x, y], -1)
-        with torch.enable_grad():
-            # The map to coefficients is elementwise, so its slope is the gradient of the sum.
-            u = weight * pad(y + head(both), [0, self.unvaried])
-            u = (self.reference + u).detach().requires_grad_()
-            coefficients = self.to_coefficients(u)
-            (by_u,) = torch.autograd.grad(coefficients.sum(), u)
-        by_u = by_u * weight
-        own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
+        n = y + head(both)
+        # The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
+        s = self.to_coefficients(self.reference + weight * pad(n, [0, self.unvaried])) / self.scale
+        rounded = s * s / (s * s + self.roundness**2)
+        by_u = self.scale * torch.where(self.positive, rounded, 1.0)
+        by_head = head.input_jacobian(both).permute(3, 0, 1, 2)
         # The outputs of the rules are also inputs of the head.
-        by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
-        by_y = pad(by_y, [0, 0, 0, self.unvaried])
-        by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
-        by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
-        if not self.learn_sets:
-            factors = ((by_rules, anfis.regressors(x)), (by_head, head.activations(both)))
-            return Sensitivity(factors, by_qd, by_qdd)
-        columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
-        shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
-        by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
-        by_unit = by_head @ head.output_weight.repeat_interleave(head.inputs, -1)
-        # Derivatives of a unit's output by its centre and log width, both over the squared width.
-        moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
-        moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
-        return Sensitivity(
-            (
+        by_input, by_y = by_head.tensor_split([x.shape[-1]], -1)
+        by_x = anfis.input_jacobian(x).permute(3, 0, 1, 2)
+        by_x = (by_x + by_input + by_y @ by_x) * weight[..., None]
+        # A clamped input no longer affects the network itself, only the weight of its output.
+        by_x = torch.where((beyond == 0.0).unsqueeze(-2), by_x, 0.0)
+        by_x = by_x + n[..., None] * taper_slope(beyond, self.reach)[..., None, :]
+        by_x = pad(by_x, [0, 0, 0, self.unvaried]) * by_u[..., None]
+        by_speed, by_acceleration = by_x.unbind(-1)
+        velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
+        by_qd = by_speed * (qd.sign() / velocity)[..., None]
+        by_qdd = by_acceleration / span[:, None]
+        if self.along_motion:
+            turned = torch.tanh(qd / velocity / self.turn)
+            turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
+            by_qd, by_qdd = by_qd + by_qdd * turning[..., None], by_qdd * turned[..., None]
+
+        @torch.no_grad()
+        def factors() -> tuple[tuple[Tensor, Tensor], ...]:
+            own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
+            through, direct = pad(by_y, [0, 0, 0, self.unvaried]), (by_u * weight)[..., None]
+            by_rules, by_weights = direct * (own + through), direct * own
+            if not self.learn_sets:
+                return (by_rules, anfis.regressors(x)), (by_weights, head.activations(both))
+            columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
+            shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
+            by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
+            by_unit = by_weights @ head.output_weight.repeat_interleave(head.inputs, -1)
+            # Derivatives of a unit's output by its centre and log width, both over the squared
+            # width.
+            moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
+            moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
+            return (
                 (by_rules, columns[:, :shared].movedim(-1, 0)),
-                (by_head, units[:, : head.units].movedim(-1, 0)),
+                (by_weights, units[:, : head.units].movedim(-1, 0)),
                 *(
                     (by_rules @ (by_set @ rows), one)
                     for rows in anfis.partition.jacobian().values()
                 ),
                 *((by_unit * part.unsqueeze(2), one) for part in moved.unbind(2)),
-            ),
-            by_qd,
-            by_qdd,
-        )
+            )
+
+        return Sensitivity(factors, by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
         return {

@@ -97,13 +97,14 @@ class Sensitivity:
     the derivative is an outer product, which is stored as its two factors.
 
     Attributes:
-        factors: for each group, the derivatives of the coefficients with respect to the outputs,
-            (sample, joint, coefficient, output), and the features, (sample, joint, feature).
+        factors: computes, for each group, the derivatives of the coefficients with respect to the
+            outputs, (sample, joint, coefficient, output), and the features, (sample, joint,
+            feature); most of the work, and not needed for derivatives by the motion alone.
         qd: with respect to the joint's own velocity, (sample, joint, coefficient).
         qdd: with respect to the joint's own acceleration, (sample, joint, coefficient).
     """
 
-    factors: tuple[tuple[Tensor, Tensor], ...]
+    factors: Callable[[], tuple[tuple[Tensor, Tensor], ...]]
     qd: Tensor
     qdd: Tensor
 
@@ -119,20 +120,21 @@ class Sensitivity:
         zero = by_parameter.new_zeros(()).expand(*motion.shape, count)
         # The parameters share nothing, so their only feature is 1.
         one = by_parameter.new_ones(()).expand(*motion.shape, 1)
-        return cls(((by_parameter.expand(*motion.shape, count, -1), one),), zero, zero)
+        whole = by_parameter.expand(*motion.shape, count, -1)
+        return cls(lambda: ((whole, one),), zero, zero)
 
     @property
     def parameters(self) -> Tensor:
         """Full derivative by the parameter vector, (sample, coefficient, parameter)."""
         # Large, but only computed for short segments; sums over a motion use `contract`.
-        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
+        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors()]
         return torch.cat(whole, -1)
 
     @property
     def joint(self) -> Tensor:
         """The joint whose coefficients each parameter affects, (parameter,)."""
         rows = []
-        for mix, features in self.factors:
+        for mix, features in self.factors():
             joints = torch.arange(mix.shape[1], device=mix.device)
             rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
         return torch.cat(rows)
@@ -148,8 +150,8 @@ class Sensitivity:
             Shape (block, row, parameter).
         """
         blocks, rows, samples = cotangent.shape[:3]
-        found = []
-        for mix, features in self.factors:
+        found = [cotangent.new_zeros(blocks, rows, 0)]
+        for mix, features in self.factors():
             mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
             if features.shape[-1] == 1:
                 # No shared features: one product over samples and coefficients is faster.

@@ -207,6 +207,20 @@ class Anfis(LinearOutputModule):
         return F
 
     @torch.no_grad()
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """In closed form: the rules' slopes, and Q dlog m / dx of the sets (`jacobian_columns`)."""
+        shared, own = self._column_counts
+        rules, by_set = self.jacobian_columns(x).tensor_split([shared], 1)
+        # An input has the opposite effect of the centres of its sets.
+        by_centre = by_set.unflatten(1, (self.outputs, own))[:, :, : sum(self.terms)]
+        by_input = (by_centre / self.sets()[1][:, None, :, None]).split(self.terms, 2)
+        found = -torch.stack([part.sum(2) for part in by_input], 2)
+        if self.order == 1:
+            strengths = rules[:, self.inputs :: self.inputs + 1]
+            found += torch.einsum("gkri,grs->gkis", self.consequents[..., :-1], strengths)
+        return found
+
+    @torch.no_grad()
     def jacobian_maps(self) -> dict[str, Tensor]:
         """Map of each trained parameter by name, (groups, outputs, columns, entries of a group)."""
         shared, own = self._column_counts

@@ -49,31 +49,8 @@ def input_range(
     return low, high
 
 
-class GroupedModule(nn.Module):
-    """Module from (*batch, groups, inputs) to (*batch, groups, outputs), sample by sample."""
-
-    groups: int
-    inputs: int
-    outputs: int
-
-    def input_jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output with respect to the inputs of its group.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (groups, outputs, inputs, samples).
-        """
-        x = x.detach().requires_grad_()
-        with torch.enable_grad():
-            # Samples are independent, so the gradient of their sum contains the derivative of each.
-            sums = self(x).flatten(0, -2).sum(0)
-            rows = [torch.autograd.grad(y, x, retain_graph=True)[0] for y in sums]
-        return torch.stack(rows, 2).movedim(0, -1)
-
-
-class LinearOutputModule(GroupedModule):
-    """Layer that is linear in its regressors, whose outputs share the columns of their derivatives.
+class LinearOutputModule(nn.Module):
+    """Layer from (*batch, groups, inputs) to (*batch, groups, outputs), linear in its regressors.
 
     The outputs share hidden units, so their derivatives are combinations of fewer columns than
     there are parameters. With F = jacobian_columns(x)[g] and M = jacobian_maps()[name][g, k],
@@ -84,6 +61,14 @@ class LinearOutputModule(GroupedModule):
     product of full Jacobians (`nfriction.papers.nffem.jacobian`). The first columns are the
     regressors, from which `readout` computes the outputs.
     """
+
+    groups: int
+    inputs: int
+    outputs: int
+
+    @abstractmethod
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """Derivatives (groups, outputs, inputs, samples) at x (samples, groups, inputs)."""
 
     @abstractmethod
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:

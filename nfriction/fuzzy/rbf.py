@@ -79,6 +79,15 @@ class RBFNetwork(grouped.LinearOutputModule):
         return grouped.to_rows(self._activations(x), x)
 
     @torch.no_grad()
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """In closed form, from the expanded exponents."""
+        _, quadratic, powers = self._expanded(x)
+        weights = self.output_weight.unsqueeze(2) * quadratic.mT.unsqueeze(1)
+        slopes = weights.flatten(1, 2) @ self._activations(x)
+        square, linear = slopes.unflatten(1, (self.outputs, 2, self.inputs)).unbind(2)
+        return 2.0 * square * powers[:, self.inputs :].unsqueeze(1) + linear
+
+    @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """The units and 1, (groups, units + 1, samples), written to `out`."""
         constant, quadratic, powers = self._expanded(x)
@@ -236,7 +245,7 @@ class RBFNetwork(grouped.LinearOutputModule):
         return samples
 
 
-class AnfisRBF(grouped.GroupedModule):
+class AnfisRBF(nn.Module):
     """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
 
     The ANFIS provides the main fit and the head refines it; the output of a new head is zero.

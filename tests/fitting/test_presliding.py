@@ -84,6 +84,8 @@ def test_derivatives_follow_the_deflections_from_a_windows_start(
     own = states[:, 2 * joints :]
     own[:] = torch.linspace(-0.9, 0.8, own.numel(), dtype=F64).reshape(own.shape)
     found = problem.linearise(x).gradient
+    of_states = problem.linearise(x, states=True).gradient
+    torch.testing.assert_close(of_states, found[problem.variables.shared_count :])
     for k in [*range(joints * len(values)), *range(len(x) - states.numel(), len(x))]:
         # A network's parameters are zero.
         step = 1e-6 * max(abs(float(x[k])), 1e-3) if x[k] else 1e-5

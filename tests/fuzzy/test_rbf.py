@@ -90,9 +90,8 @@ def test_output_layer_is_stationary(prior_precision: float) -> None:
         assert gradient.abs().max() < 1e-9 * y.square().sum()
 
 
-@pytest.mark.parametrize("kind", ["network", "combined"])
-def test_the_input_jacobian_is_each_output_s_own(kind: str) -> None:
-    network = shaken(RBFNetwork(3) if kind == "network" else AnfisRBF(3, 2, (4, 3), 2))
+def test_the_input_jacobian_is_each_output_s_own() -> None:
+    network = shaken(RBFNetwork(3))
     x = samples(20, 3, 2).requires_grad_()
     y = network(x)
     found = network.input_jacobian(x)

@@ -84,23 +84,29 @@ class ShootingProblem:
         """Half the sum of squares of errors and priors."""
         return self._cost(x, self.simulate(x))
 
-    def linearise(self, x: Tensor) -> Quadratic:
-        """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
+    def linearise(self, x: Tensor, *, states: bool = False) -> Quadratic:
+        """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation.
+
+        With `states`, without derivatives with respect to the shared variables.
+        """
+        held = self.variables.shared_count if states else 0
         run = self.simulate(x, with_memory=True)
         errors = self.deviation(x, run)
         scale = self.scale * self.loss.weight(errors).sqrt()
-        rows = self.rows(run, scale)
-        gradient, hessian = normal_equations(rows, errors * scale, self.variables.indices(), len(x))
-        if self.extrapolation is not None:
+        rows = self.rows(run, scale, states=states)
+        gradient, hessian = normal_equations(
+            rows, errors * scale, self.variables.indices() - held, len(x) - held
+        )
+        if self.extrapolation is not None and not states:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
             gradient[: len(slope)] += slope
             hessian[: len(slope), : len(slope)] += curvature
         precision, mean = self.variables.prior()
-        gradient += precision * (x - mean)
-        hessian.diagonal().add_(precision)
+        gradient += (precision * (x - mean))[held:]
+        hessian.diagonal().add_(precision[held:])
         # Encoder offsets couple the states of different windows.
         alone = not self.variables.offset_count
-        blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
+        blocks = (self.variables.shared_count - held, self.variables.state_count) if alone else None
         return Quadratic(self._cost(x, run), gradient, hessian, blocks)
 
     def errors(self, x: Tensor) -> Tensor:
@@ -190,7 +196,8 @@ class ShootingProblem:
         precision, mean = self.variables.prior()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
-    def rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
-        """Rows of the Jacobian, some samples at a time."""
-        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
-        return scaled_rows(pieces, scale, self.measurement, self.variables.indices())
+    def rows(self, run: Trajectory, scale: Tensor, *, states: bool = False) -> Iterator[Rows]:
+        """Rows of the Jacobian, some samples at a time; `states`: see `linearise`."""
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride, states=states)
+        indices = self.variables.indices() - self.variables.shared_count * states
+        return scaled_rows(pieces, scale, self.measurement, indices)

@@ -9,7 +9,7 @@ parameters, so constant and neuro-fuzzy models are fitted in the same way.
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -141,7 +141,7 @@ class Trajectory:
 
 
 def propagate(
-    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int
+    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int, *, states: bool = False
 ) -> Iterator[tuple[slice, Tensor]]:
     """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
@@ -150,6 +150,7 @@ def propagate(
         run: the windows' motion.
         substeps: steps per sample.
         stride: samples per counted one.
+        states: derivatives with respect to the initial states only.
 
     Yields:
         Samples, and (window, sample, joint, column) with respect to friction parameters, plant
@@ -157,23 +158,22 @@ def propagate(
         not.
     """
     windows, steps = run.step.shape
-    joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
-    friction_count = run.friction.schedule.parameter_vector().numel()
-    shared, state = friction_count + plant_count, run.state
+    joints, state = run.motion.q.shape[-1], run.state
+    parameters = run.friction.schedule.parameter_vector().numel()
+    friction_count, plant_count = (0, 0) if states else (parameters, len(run.plant_vector))
+    shared = friction_count + plant_count
     own = state.shape[-1]
     carried = torch.zeros(windows, own + joints, shared + own, dtype=torch.float64)
     carried[:, :own, shared:] = torch.eye(own, dtype=torch.float64)
     if run.law_slope is not None:
-        law = slice(2 * joints, own)
-        carried[:, law, :friction_count], carried[:, law, shared + 2 * joints :] = (
-            run.law_slope.tensor_split([friction_count], -1)
-        )
+        by_friction, by_share = run.law_slope.tensor_split([parameters], -1)
+        carried[:, 2 * joints : own, :friction_count] = by_friction[..., :friction_count]
+        carried[:, 2 * joints : own, shared + 2 * joints :] = by_share
     motion = slice(shared, shared + 2 * joints)
-    carried[:, own:, motion], carried[:, own:, friction_count:shared] = (
-        jacobian.initial_acceleration(
-            run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
-        ).tensor_split([2 * joints], -1)
-    )
+    carried[:, own:, motion], by_plant = jacobian.initial_acceleration(
+        run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
+    ).tensor_split([2 * joints], -1)
+    carried[:, own:, friction_count:shared] = by_plant[..., :plant_count]
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
@@ -186,6 +186,7 @@ def propagate(
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
         held, slope = _coefficients(run.friction, qd, qdd, memory)
+        slope = replace(slope, factors=tuple) if states else slope
         derivative = jacobian.after_step(before, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
@@ -225,18 +226,13 @@ def _compose(
     """
     samples, joints, k = slope.qd.shape
     own = derivative.shape[-2] - joints
-    by_own, by_held, by_plant = derivative.split([own, joints * k, plant_count], dim=-1)
+    by_own, by_held, by_plant = derivative.tensor_split([own, own + joints * k], -1)
+    by_plant = by_plant[..., :plant_count]
     of_joint = by_held.unflatten(-1, (joints, k))
     by_q, by_qd, by_law = by_own.tensor_split([joints, 2 * joints], -1)
-    by_state = torch.cat(
-        [
-            by_q,
-            by_qd + torch.einsum("sijk,sjk->sij", of_joint, slope.qd),
-            by_law,
-            torch.einsum("sijk,sjk->sij", of_joint, slope.qdd),
-        ],
-        -1,
-    )
+    by_motion = torch.stack([slope.qd, slope.qdd], -1)
+    by_rate, by_acceleration = torch.einsum("sijk,sjkd->dsij", of_joint, by_motion)
+    by_state = torch.cat([by_q, by_qd + by_rate, by_law, by_acceleration], -1)
     state, held, plant = (
         x.unflatten(0, (samples // block, block)) for x in (by_state, by_held, by_plant)
     )

@@ -309,18 +309,18 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
     options, count = problem.options, problem.variables.shared_count
     shared = x[:count]
 
-    def of_states(states: Tensor) -> Quadratic:
-        whole = problem.linearise(torch.cat([shared, states]))
-        blocks = (0, whole.blocks[1]) if whole.blocks else None
-        return Quadratic(whole.cost, whole.gradient[count:], whole.hessian[count:, count:], blocks)
+    def at(states: Tensor) -> Tensor:
+        return torch.cat([shared, states])
 
     solver = LevenbergMarquardt(
         max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
     )
     result = solver.minimise(
-        of_states, x[count:], cost=lambda states: problem.cost(torch.cat([shared, states]))
+        lambda states: problem.linearise(at(states), states=True),
+        x[count:],
+        cost=lambda states: problem.cost(at(states)),
     )
-    return torch.cat([shared, result.x]), result.status == "stopped"
+    return at(result.x), result.status == "stopped"
 
 
 def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:

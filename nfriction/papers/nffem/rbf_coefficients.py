@@ -242,7 +242,8 @@ class RBFCoefficients(Schedule):
             turning = (by_input[..., 1:] * rest[:, :, None]).sum(-1)
             by_qd = by_qd + turning * ((1.0 - sign * sign) / turn)[..., None]
             by_qdd = by_qdd * sign[..., None]
-        return Sensitivity(((free[..., None] * own, self.network.regressors(x)),), by_qd, by_qdd)
+        factors = ((free[..., None] * own, self.network.regressors(x)),)
+        return Sensitivity(lambda: factors, by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
         found: dict[str, Any] = {
