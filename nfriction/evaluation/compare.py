@@ -12,7 +12,13 @@ import pandas as pd
 
 from nfriction.evaluation.parallel import Data, FitsInterrupted, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
-from nfriction.fitting.data.inputs import as_model, finer_counts, require_drive, warn_of_undriven
+from nfriction.fitting.data.inputs import (
+    as_model,
+    finer_counts,
+    released,
+    require_drive,
+    warn_of_undriven,
+)
 from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
@@ -21,7 +27,7 @@ from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
-from nfriction.signals import kalman_smoother
+from nfriction.signals import Motion, kalman_smoother
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -376,6 +382,11 @@ def compare(
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
     check_recordings(train, test)
+    states = initial_states or {}
+    train, test = (
+        [r for one in part for r in ([one] if one.name in states else released([one]))]
+        for part in (train, test)
+    )
     for name in models:
         require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
@@ -398,7 +409,6 @@ def compare(
         progress.resume()
     warned += _warned(_mistakes(plant, next(iter(fits.values())), data, tested))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
-    states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
     for name in (NO_FRICTION, *fits):
         progress.stage(f"score {name}")
@@ -438,23 +448,32 @@ def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator
 
 
 def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
-    """A sentence if test recordings are faster than all training recordings."""
+    """A sentence if test recordings are faster than all training recordings, or turn otherwise."""
     fastest, found = np.max([np.abs(m.qd).max(0) for m in train.motions], axis=0), []
-    for recording, moved in zip(*test, strict=True):
-        # Pure noise exceeds other pure noise in half of all cases.
-        noise = 0.0 if moved.std is None else 2.0 * moved.std.qd
-        speeds = np.quantile(np.abs(moved.qd) - noise, 1.0 - FASTER, axis=0)
-        place = recording.name or "a recording"
-        found += [
-            f"{name} of {place} ({speed:.3g} against {known:.3g} {plant.unit}/s)"
-            for name, speed, known in zip(plant.joint_names, speeds, fastest, strict=True)
-            if speed > known
-        ]
+    for sign in (1, -1):
+        trained = np.max([_usual_speed(m, sign) for m in train.motions], axis=0) > 0
+        for recording, moved in zip(*test, strict=True):
+            of = f"of {recording.name or 'a recording'}"
+            speeds = _usual_speed(moved, sign)
+            known = np.where(trained, fastest, 0.0)
+            found += [
+                f"{name} {of} ({sign * speed:.3g} against {sign * most + 0.0:.3g} {plant.unit}/s)"
+                for name, speed, most in zip(plant.joint_names, speeds, known, strict=True)
+                if speed > most
+            ]
     if found:
         yield (
             "friction is extrapolated to speeds that no training recording reaches: "
-            f"{', '.join(found)}; train on motions as fast as those to be simulated."
+            f"{', '.join(found)}; train on motions as fast as those to be simulated, in both "
+            "directions."
         )
+
+
+def _usual_speed(motion: Motion, sign: int) -> np.ndarray:
+    """Speed in a direction that most samples do not exceed, (joint,) [rad/s; m/s]."""
+    # Pure noise exceeds other pure noise in half of all cases.
+    noise = 0.0 if motion.std is None else 2.0 * motion.std.qd
+    return np.quantile(sign * motion.qd - noise, 1.0 - FASTER, axis=0)
 
 
 def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> None:

@@ -14,7 +14,11 @@ import pandas as pd
 from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
-from nfriction.fitting.data.inputs import apply_encoder_offsets, looks_zeroed_per_recording
+from nfriction.fitting.data.inputs import (
+    apply_encoder_offsets,
+    looks_zeroed_per_recording,
+    released,
+)
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
@@ -147,7 +151,7 @@ def select(
     if not isinstance(horizon, Real) or not 0 < horizon < math.inf:
         raise ValueError(f"`horizon` must be a positive length [s] such as 5.0, got {horizon!r}.")
     models = [models] if isinstance(models, str) else models
-    recordings = Recording.many(recordings, plant=plant)
+    recordings = released(Recording.many(recordings, plant=plant))
     if not isinstance(folds, Integral) or folds < 2 or not models or not recordings:
         raise ValueError(
             "selection needs models, recordings and a whole number of at least 2 folds, got "

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN, Runs, Simulator, with_own_zero
+from nfriction.fitting.data.inputs import released
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
@@ -147,6 +148,8 @@ def score(
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
+    if initial_state is None:
+        (recording,) = released([recording])
     horizons = checked_lengths("horizons", horizons, 0)
     zero = None
     if zeroed:

@@ -182,10 +182,10 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
 
 
 def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
-    """Recordings of wrapped angles, and those that lack or repeat rows under even times.
+    """Wrapped angles, counters that overflow, and rows lost, repeated or stale under even times.
 
-    Between two steps before and two after it that are all alike, a step of twice their length lacks
-    a row, and one of zero repeats a row: no joint moves so.
+    Between steps that are all alike, a step of twice their length lacks a row, one of zero repeats
+    a row, and one of zero before one of twice their length repeats a position: no joint moves so.
     """
     for recording in recordings:
         name = recording.name or "a recording"
@@ -193,26 +193,45 @@ def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mi
         if wrapped and recording.unit == "rad":
             text = f"positions of {name} are wrapped (unwrap them, as `numpy.unwrap(q, axis=0)`)"
             yield Mistake(text, math.nan)
+        # The motion goes on in one direction, and the position jumps back by most of its range.
+        step = np.diff(recording.q, axis=0)
+        step[gaps(recording.time)] = 0.0
+        before, at, after = step[:-2], step[1:-1], step[2:]
+        far = np.fmax(np.ptp(recording.q, axis=0) / 2, 2 * (np.abs(before) + np.abs(after)))
+        back = (at * before < 0) & (at * after < 0) & (np.abs(at) > far)
+        for joint, jump in zip(recording.names, (back * np.abs(at)).max(0), strict=True):
+            if jump:
+                text = (
+                    f"a counter overflows: {joint} of {name} jumps by {jump:.3g} {recording.unit}"
+                )
+                remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)`"
+                yield Mistake(f"{text} ({remedy})", math.nan)
         q, time = (sliding_window_view(x, 6, axis=0) for x in (recording.q, recording.time))
         steps = np.diff(q)
-        mean = np.delete(steps, 2, -1).mean(-1)
-        apart, size = np.ptp(np.delete(steps, 2, -1), axis=-1), np.abs(mean)
         noise = np.median(np.abs(np.diff(recording.q, n=2, axis=0)), axis=0)
-        seen = size * ALIKE > np.fmax(noise, count_seen(recording.q))
         even = np.ptp(np.diff(time), axis=-1) < ALIKE * recording.sample_time
-        seen &= (apart < ALIKE * size) & even[:, None]
-        for factor, rows, remedy in (
-            (2, "missing", "use the logger's own time stamps"),
-            (0, "repeated", "drop repeated rows before rows are given their times"),
+        for factors, rows, remedy in (
+            ([2], "are missing", "use the logger's own time stamps"),
+            ([0], "are repeated", "drop repeated rows before rows are given their times"),
+            ([0, 2], "repeat the position before", "drop these rows, with their times"),
         ):
+            broken = slice(2, 2 + len(factors))
+            others = np.delete(steps, broken, -1)
+            mean, apart = others.mean(-1), np.ptp(others, axis=-1)
+            size = np.abs(mean)
+            seen = size * ALIKE > np.fmax(noise, count_seen(recording.q))
+            seen &= (apart < ALIKE * size) & even[:, None]
             # A row is lost for all joints. Noise causes half of this error more often.
             found, half = (
-                int((seen.any(1) & ((np.abs(error) < ALIKE * size) | ~seen).all(1)).sum())
-                for error in (steps[..., 2] - x * mean for x in (factor, (1 + factor) / 2))
+                int((seen.any(1) & ((error < ALIKE * size) | ~seen).all(1)).sum())
+                for error in (
+                    np.abs(steps[..., broken] - mean[..., None] * x).max(-1)
+                    for x in (np.array(factors), (1 + np.array(factors)) / 2)
+                )
             )
             share = found / max(1, int(seen.any(1).sum()))
             if found >= max(MINIMUM_SAMPLES, half) and share > options.clock_error[0]:
-                of = f"about {100 * share:.2g} % of the rows of {name} are {rows}"
+                of = f"about {100 * share:.2g} % of the rows of {name} {rows}"
                 yield Mistake(f"{of}, although `time` goes on evenly ({remedy})", math.nan)
 
 
@@ -251,7 +270,7 @@ def _tested(
 ) -> Iterator[tuple[str, float]]:
     for text, data in _corrected_positions(plant, convention, given):
         yield text, _unexplained(plant, data)
-    for text, rig in _corrected_rigs(plant):
+    for text, rig in _corrected_rigs(plant, bool(given.tau.any())):
         yield text, _unexplained(rig, given)
     if given.tau.any():
         for text, data in _corrected_torques(plant, given, options):
@@ -456,14 +475,21 @@ def _corrected_positions(
                 yield f"the columns of {both} are exchanged", replace(swapped, tau=tau)
 
 
-def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
+def _corrected_rigs(plant: Plant, driven: bool) -> Iterator[tuple[str, Plant]]:
     data = plant.to_dict()
     if "buffers" in data:
         return  # they would override the corrected arguments
     motor = data.get("motor") or {}
     given = data | motor
     rotor, milli = "rotor_inertia" if motor else "armature", {"length": 1e-3, "com": 1e-3}
-    mistakes: dict[str, dict[str, float]] = {
+    mistakes: dict[str, dict[str, float]] = {}
+    if driven:
+        # The keys of a rotor differ.
+        none = {"gravity": 1e-6} if "gravity" in given else {"mass": 0.0, "com": 0.0}
+        remedy = "`gravity`: 1e-6" if "gravity" in given else "no `mass`"
+        text = f"torques show no gravity: joints turn in a horizontal plane ({remedy}), or a"
+        mistakes[f"{text} controller compensates it with torques that are not recorded"] = none
+    mistakes |= {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
         "lengths are in mm": milli,

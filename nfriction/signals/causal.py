@@ -37,17 +37,20 @@ def count_seen(q: ArrayLike) -> Array:
     """Estimate one count of each joint's encoder, (joint,), NaN if positions do not show it.
 
     It is the smallest change from one sample to the next if 1 % of the changes equal it: the
-    smallest change of noise, or of numbers with many digits, hardly recurs.
+    smallest change of noise, or of numbers with many digits, hardly recurs. A joint that never
+    stops changes by many counts at once, so for it the differences of changes are taken instead.
 
     Args:
         q: positions as read from the encoder [rad or m], shape (..., time, joint).
     """
     q = np.asarray(q, dtype=np.float64)
-    changes = np.abs(np.diff(q, axis=-2)).reshape(-1, q.shape[-1])
-    spans = np.ptp(q.reshape(-1, q.shape[-1]), axis=0)
     found = np.full(q.shape[-1], np.nan)
-    for joint, (change, span) in enumerate(zip(changes.T, spans, strict=True)):
-        moved = change[change > ROUNDING * span]
+    for joint in range(q.shape[-1]):
+        least = ROUNDING * np.ptp(q[..., joint])
+        change = np.abs(np.diff(q[..., joint], axis=-1))
+        if (change > least).all():
+            change = np.abs(np.diff(q[..., joint], n=2, axis=-1))
+        moved = change[change > least]
         if len(moved) and np.mean(moved <= (1 + ALIKE) * moved.min()) >= REPEATED:
             found[joint] = moved.min()
     return found

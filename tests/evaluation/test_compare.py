@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from nfriction import LFM, NFLFM, compare
+from nfriction import LFM, NFLFM, Recording, Rotor, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
 from nfriction.evaluation.compare import Comparison, Fits, coefficient_summary
 from nfriction.evaluation.parallel import Progress
@@ -154,6 +154,14 @@ def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
     assert not [w for w in recwarn if "extrapolated" in str(w.message)]
     with pytest.warns(UserWarning, match=r"joint1 of a \(8.79 against 6.08 rad/s\), joint2 of a"):
         compare(pendulum(), "NCFM", B, A, **settings)
+
+
+def test_a_direction_without_training_is_named():
+    time = np.arange(0.0, 2.0, 2e-3)
+    forward = (10 * time - time**2)[:, None]
+    parts = (Recording(time, q, name=name) for q, name in ((forward, "a"), (-0.9 * forward, "b")))
+    with pytest.warns(UserWarning, match=r"joint1 of b \(-[89]\.\d+ against 0 rad/s\); train"):
+        compare(Rotor(0.02), "NCFM", *parts, horizons=(0.5,), windows=(0.5,), max_steps=1)
 
 
 def test_a_mistake_in_a_test_recording_is_named(recwarn):

@@ -344,6 +344,17 @@ def test_mistakes_in_rigs(name, rig, finding):
     assert finding in warnings_of(plant, q, tau)[0]
 
 
+@pytest.mark.parametrize(("name", "remedy"), [("driven", "`gravity`: 1e-6"), ("arm", "no `mass`")])
+def test_torques_without_gravity_are_named(name, remedy):
+    """The rig lies flat, or its controller adds gravity after the torque is recorded."""
+    plant, q, tau = measured("motor" if name == "arm" else name)
+    if name == "arm":
+        plant = Rotor(0.08, mass=1.0, com=0.15, convention=["relative", "upright"])
+    held = plant.gravity(torch.as_tensor(q)).numpy()
+    first = warnings_of(plant, q, tau - held)[0]
+    assert f"torques show no gravity: joints turn in a horizontal plane ({remedy})" in first
+
+
 @pytest.mark.parametrize(("name", "stiffness"), [("axis", 40.0), ("wheel", 1.5)])
 def test_a_spring_that_the_rig_lacks_is_named(name, stiffness):
     plant, q, tau = measured(name)
@@ -362,6 +373,24 @@ def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
     rows = np.repeat(np.arange(len(q)), rows)
     found = warnings_of(plant, q[rows], tau[rows], time=STEP * np.arange(len(rows)))
     assert f"% of the rows of a recording are {named}, although" in found[0]
+
+
+def test_stale_positions_are_named():
+    """A sensor slower than the log repeats its last position, with the torque going on."""
+    plant, q, tau = measured("wheel", 1e-4)
+    rows = np.arange(len(q))
+    late = np.random.default_rng(0).choice(len(q) - 1, len(q) // 20, replace=False) + 1
+    rows[late] -= 1
+    first = warnings_of(plant, q[rows], tau)[0]
+    assert "% of the rows of a recording repeat the position before, although" in first
+
+
+@pytest.mark.parametrize("period", [0.3, 25.0])
+def test_an_overflow_that_recurs_or_is_rare_is_named_first(period):
+    """Many jumps look like a lively motion, and a filter makes an elastic joint of them."""
+    plant, q, tau = measured("wheel")
+    first = warnings_of(plant, 20 * q % period, tau)[0]
+    assert "likely: a counter overflows: joint1 of a recording jumps by" in first
 
 
 def test_wrapped_angles_are_no_elastic_joint():

@@ -1,12 +1,16 @@
 """Windows cover recordings, restart at their own samples, and pad without weight."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, PendulumChain, Recording, fit, rollout
+from nfriction import CVFM, PendulumChain, Recording, fit, rollout, score
+from nfriction.fitting.data.inputs import released
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.signals import Motion, quantise
+from tests.fitting.recordings import one_link, swing
 
 
 def made(samples, seed=0, tau=False):
@@ -145,3 +149,36 @@ def test_no_window_reaches_over_a_gap(length):
     assert float(w.step.max()) < 0.1
     assert int((w.weight.sum(1) - 1).sum()) == 299
     assert [span for span in w.spans if span[1] <= 120 < span[2]] == []
+
+
+@pytest.mark.parametrize("held", [0.1, 1.0])
+def test_a_free_motion_is_used_from_its_release(held):
+    """The rest before it is that of a hand; no friction holds a link that moves later."""
+    plant = one_link()
+    whole = swing(plant, CVFM(1, [5e-3, 1e-3]), seconds=2.0)
+    rows = np.r_[np.zeros(round(held / 2e-3), int), 0 : len(whole)]
+    late = Recording(2e-3 * np.arange(len(rows)), whole.q[rows], convention=whole.convention)
+    with pytest.warns(UserWarning, match="has no torque, and rests for .* held or pushed"):
+        (found,) = released([late])
+    assert found.time[0] == pytest.approx(held, abs=0.02)
+    assert released([found])[0] is found
+    assert released([whole])[0] is whole
+    # A drive may begin later than the log.
+    driven = replace(late, tau=np.ones_like(late.q))
+    assert released([driven])[0] is driven
+
+
+def test_a_hold_before_the_release_changes_no_fit_and_no_score():
+    plant, truth = one_link(), CVFM(1, [5e-3, 1e-3])
+    whole = swing(plant, truth, seconds=3.0)
+    rows = np.r_[np.zeros(250, int), 0 : len(whole)]
+    late = Recording(2e-3 * np.arange(len(rows)), whole.q[rows], convention=whole.convention)
+    with pytest.warns(UserWarning, match="held or pushed"):
+        found = fit("CVFM", plant, late, windows=(0.5,))
+    expected = fit("CVFM", plant, whole, windows=(0.5,))
+    torch.testing.assert_close(
+        found.model.schedule.values, expected.model.schedule.values, rtol=0.02, atol=1e-5
+    )
+    with pytest.warns(UserWarning, match="held or pushed"):
+        of_late = score(plant, truth, late, limit=False)
+    assert of_late.free_run.all < 2e-3

@@ -398,6 +398,9 @@ def test_a_count_is_seen_where_changes_repeat():
     # Turned into other coordinates and back, or written with few digits.
     for q in (read, np.pi + (read - np.pi), read.round(5)):
         np.testing.assert_allclose(count_seen(q), quantum, rtol=0.02)
+    # A joint that never stops changes by dozens of counts at once.
+    running = quantise(30 * time[:, None] + smooth, 8192)
+    np.testing.assert_allclose(count_seen(running), quantum, rtol=1e-6)
     # Windows have no change from one to the next.
     np.testing.assert_allclose(count_seen(read[:3600].reshape(9, 400, 2)), quantum)
 

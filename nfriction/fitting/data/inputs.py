@@ -44,6 +44,9 @@ Array = NDArray[np.float64]
 TURN_SHARE = 1e-3
 # Jumps whose sizes differ by less than this fraction count as equal.
 ALIKE = 0.02
+# Shares of its range that a joint has moved just after its release, the second four times the
+# first.
+RELEASED = 0.01, 0.04
 
 
 def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
@@ -170,6 +173,44 @@ def warn_of_undriven(recordings: Sequence[Recording]) -> None:
             f"are taken to be undriven there; add the torque, or zeros if there was none.",
             stacklevel=1,
         )
+
+
+def released(recordings: Sequence[Recording]) -> list[Recording]:
+    """Recordings without torque, from the release of a mechanism that was held at first.
+
+    Without torque a mechanism at rest stays at rest, so a hand or a brake held one that moves
+    later, and no friction explains that rest.
+
+    Warns:
+        UserWarning: with the time of the release.
+    """
+    found = []
+    for recording in recordings:
+        time = _release(recording)
+        if time:
+            warnings.warn(
+                f"{recording.name or 'a recording'} has no torque, and rests for {time:.3g} s "
+                "before it moves, so it was held or pushed; it is used from its release.",
+                stacklevel=1,
+            )
+        found.append(recording[recording.time - recording.time[0] >= time] if time else recording)
+    return found
+
+
+def _release(recording: Recording) -> float:
+    """Time of the release of a mechanism without torque that was held at first [s], else 0."""
+    extent = np.ptp(recording.q, axis=0)
+    if (recording.tau is not None and recording.tau.any()) or not extent.any():
+        return 0.0
+    since = recording.time - recording.time[0]
+    away = np.abs(recording.q - recording.q[0])[:, extent > 0] / extent[extent > 0]
+    early, late = (since[(away >= share).argmax(0)] for share in RELEASED)
+    # The joint that moves first. Its acceleration is constant at first, so that it takes twice the
+    # time for four times the way.
+    first = early.argmin()
+    error = 3 * recording.sample_time + (late - early)[first] / 4
+    time = float(2 * early[first] - late[first])
+    return time if time > error else 0.0
 
 
 def require_drive(law: Law, recordings: Sequence[Recording]) -> None:

@@ -25,6 +25,10 @@ BLURRED = (
     "The torque comes from a smoothed motion, which blurs friction at low speed and ignores errors "
     'of the plant; `method="output_error"` gives better estimates, and intervals that cover both.'
 )
+PROPORTIONAL = (
+    "Without a recorded torque, friction is in proportion to the masses and inertias of the rig, "
+    "which the intervals take as exact."
+)
 # Relative changes that agree within this fraction count as equal.
 ALIKE = 0.1
 # Only the logarithm of a positive coefficient has a lower bound as small as this, in SI.
@@ -160,9 +164,11 @@ def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[s
 
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """A sentence if a whole driven rig seems heavier or lighter: masses or torques are wrong."""
+    """A sentence if a driven rig seems heavier or lighter, or if no torque shows its scale."""
+    if not problem.windows.tau.any():
+        return (PROPORTIONAL,)
     found = list(_relative_weights(problem.jacobian.plant, intervals))
-    if len(found) < 2 or not problem.windows.tau.any():
+    if len(found) < 2:
         return ()
     scale = sum(found) / len(found)
     # Like a delay, a scale matters if it takes a coefficient of torque out of its interval.
