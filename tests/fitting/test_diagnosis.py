@@ -787,6 +787,10 @@ def test_a_fit_says_whether_it_is_usable():
     assert replace(wrong, motions=turning, plant=Rotor(0.01)).usability[0] == "good"
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
+    sd = math.sqrt(np.concatenate([m.q for m in wrong.motions]).var())
+    verdicts = [replace(wrong, residual=share * sd).usability[0] for share in (0.65, 0.75)]
+    # Half of the variance is 0.71 standard deviations.
+    assert verdicts == ["doubtful", "do not use"]
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
 
 

@@ -183,7 +183,8 @@ class FitResult:
             return "do not use", reasons[0]
         if wrong and not self.converged:
             return "do not use", f"the search did not converge, and {far}"
-        if wrong and 0 < motion <= self.residual:
+        # It explains less than half of the motion's variance.
+        if wrong and 0 < motion**2 < 2 * self.residual**2:
             return "do not use", far
         if not self.converged:
             reasons.append("the search did not converge")
