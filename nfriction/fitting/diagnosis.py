@@ -151,10 +151,11 @@ def likely_mistakes(
             tested.append((f"{term.name} is {1 + x:.3g} times that of the rig", share))
     # With different zeros, recordings of the same rig have different balances.
     unlike = []
-    if len(recordings) > 1 and not zeroed:
+    if len(recordings) > 1:
         unlike = [*_unlike_zeros(plant, recordings, given, options)]
         most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
+        unlike = [] if zeroed else unlike
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
     rare = *_springs(plant, given), *_geared(plant, convention, given)

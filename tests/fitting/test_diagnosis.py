@@ -613,10 +613,18 @@ def of_several_days(rig: Plant, friction: list[float]) -> list[Recording]:
     ]
 
 
-def test_a_recording_of_another_rig_is_named():
+@pytest.mark.parametrize("zero", ["upright", "hanging"])
+def test_a_recording_of_another_rig_is_named(zero):
+    """Also if all encoders read zero at first, and may have been zeroed in any pose."""
     plant = measured("motor")[0]
     recordings = of_several_days(plant.replace(gravity_moment=2 * plant.gravity_moment), [0.8, 0.3])
-    (found,) = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
+    if zero == "hanging":
+        recordings = [
+            replace(r, q=r.q - math.pi, convention="relative,hanging") for r in recordings
+        ]
+    task = prepare_task(CVFM(1), plant, recordings, FitOptions())
+    assert task.per_recording == (zero == "hanging")
+    (found,) = task.mistakes
     of = "other is from another rig than the others, or was recorded differently"
     assert re.fullmatch(rf"{of} \(gravity 1 is 2\.0\d times that of the rig\)", found)
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
