@@ -221,9 +221,9 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
     recording, law = with_plant
     model, begun = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
 
-    def search(self, problem, vector, tolerance, name):
+    def search(self, problem, vector, tolerance, name, *least):
         begun.append(name)
-        return searched(self, problem, vector, tolerance, name)
+        return searched(self, problem, vector, tolerance, name, *least)
 
     def stop(stage, step):
         return begun.count("network, hold-out") > place

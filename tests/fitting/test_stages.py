@@ -26,13 +26,13 @@ from tests.fitting.recordings import F64, driven_axis, flywheel, pendulum, swing
 PATIENCE, SETTLED = DEFAULTS.patience, DEFAULTS.settled_move
 
 
-def ends(costs, tolerance=1e-3):
+def ends(costs, tolerance=1e-3, least=0.0, damping=10.0):
     """The status after each step of a search of these costs."""
     _, problem = short_search()
-    monitor, x = StallMonitor(problem, tolerance, DEFAULTS), problem.variables.start()
+    monitor, x = StallMonitor(problem, tolerance, DEFAULTS, least), problem.variables.start()
     local = problem.linearise(x)
     # Damped, so that a point that stays is no rest.
-    return [monitor(x, local, Step(cost, 10.0, 1.0)) for cost in costs]
+    return [monitor(x, local, Step(cost, damping, 1.0)) for cost in costs]
 
 
 def test_only_a_search_that_creeps_is_ended():
@@ -40,6 +40,10 @@ def test_only_a_search_that_creeps_is_ended():
     creeping = ends([1.0, 0.5] + [0.4 - 1e-5 * k for k in range(10)])
     assert creeping.index("creeping") == 2 + PATIENCE
     assert not any(creeping[: 2 + PATIENCE])
+    # A cost of errors far below the noise also falls by less than matters.
+    small = [0.1 * 0.9**k for k in range(8)]
+    assert not any(ends(small, least=0.01))
+    assert ends(small, least=0.0095, damping=0.1).index("converged_cost") == 2
 
 
 def test_the_caller_hears_every_step_and_may_stop():

@@ -130,12 +130,18 @@ class ShootingFitter:
         )  # fmt: skip
 
     def search(
-        self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
+        self,
+        problem: ShootingProblem,
+        start: Tensor,
+        tolerance: float,
+        name: str,
+        least: float = 0.0,
     ) -> HorizonResult:
         """Minimise a problem of this fitter.
 
-        `tolerance` is the relative decrease of the cost that counts as zero; `name` is passed to
-        the callback. A robust loss without a scale finally gets the scale of the errors.
+        Decreases of the cost below `least`, or below `tolerance` relative to it, count as zero;
+        `name` is passed to the callback. A robust loss without a scale finally gets the scale of
+        the errors.
         """
         options, x = self.options, start
         solver = LevenbergMarquardt(
@@ -152,7 +158,7 @@ class ShootingFitter:
         scaled = options.loss == problem.loss.name
         problem = problem if scaled else problem.rescaled(x)
         for _ in range(1 if scaled else options.most_scales):
-            monitor = StallMonitor(problem, tolerance, options)
+            monitor = StallMonitor(problem, tolerance, options, least)
             result = solver.minimise(
                 problem.linearise, x, cost=problem.cost, lower=lower, upper=upper, callback=report
             )
@@ -169,8 +175,11 @@ class ShootingFitter:
 class StallMonitor:
     """Ends a search whose steps creep, or whose shared variables have converged."""
 
-    def __init__(self, problem: ShootingProblem, tolerance: float, options: FitOptions) -> None:
-        self.problem, self.tolerance, self.options = problem, tolerance, options
+    def __init__(
+        self, problem: ShootingProblem, tolerance: float, options: FitOptions, least: float = 0.0
+    ) -> None:
+        self.problem, self.options = problem, options
+        self.tolerance, self.least = tolerance, least
         self.costs: list[float] = []
         self.before: Tensor | None = None
         self.still = 0
@@ -184,6 +193,9 @@ class StallMonitor:
             return None
         if self.still >= patience:
             return "converged_step"
+        weak = len(self.costs) > 1 and step.damping <= WEAK_DAMPING
+        if weak and self.costs[-2] - step.cost < self.least:
+            return "converged_cost"
         if len(self.costs) <= patience:
             return None
         before = self.costs[-1 - patience]

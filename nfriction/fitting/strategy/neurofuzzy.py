@@ -518,12 +518,15 @@ class Validation:
         """The network of a trial, fitted further to other windows."""
         (friction, plant, *_), before = trial.end.parts, trial.end.problem
         problem = trial.fitter.problem(windows, before.noise_sd, friction, stride=before.stride)
-        return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
+        start, least = problem.variables.start(plant), self.options.loglik_tolerance
+        return trial.fitter.search(problem, start, trial.tolerance, name, least)
 
     def trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> Trial:
         """A search on the first split."""
         problem = fitter.problem(self.splits[0][0], self.noise, friction, stride=self.stride)
-        end = fitter.search(problem, problem.variables.start(self.plant), self.tolerance, name)
+        # The noise is that of the law, so the cost of a network falls far below that of the law.
+        start, least = problem.variables.start(self.plant), self.options.loglik_tolerance
+        end = fitter.search(problem, start, self.tolerance, name, least)
         return Trial(self._errors(end, self.splits[0][1]), fitter, end, self.tolerance)
 
     def judged(self, trial: Trial) -> Trial:
