@@ -382,11 +382,6 @@ def compare(
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
     check_recordings(train, test)
-    states = initial_states or {}
-    train, test = (
-        [r for one in part for r in ([one] if one.name in states else released([one]))]
-        for part in (train, test)
-    )
     for name in models:
         require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
@@ -395,7 +390,7 @@ def compare(
     # Smoothed once for all fits.
     data, tested = (
         Data(part, [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in part])
-        for part in (train, test)
+        for part in (released(train), released(test))
     )
     warned = _warned(_faster(plant, data, tested))
     try:
@@ -409,6 +404,7 @@ def compare(
         progress.resume()
     warned += _warned(_mistakes(plant, next(iter(fits.values())), data, tested))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
+    states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
     for name in (NO_FRICTION, *fits):
         progress.stage(f"score {name}")

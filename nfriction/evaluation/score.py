@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN, Runs, Simulator, with_own_zero
-from nfriction.fitting.data.inputs import released
+from nfriction.fitting.data.inputs import release
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
@@ -130,7 +130,8 @@ def score(
     Args:
         plant: the mechanism, its name, or the path of a rig file.
         friction: friction model, or None for no friction.
-        recording: or its path or table; without an angle convention it has the plant's.
+        recording: or its path or table; without an angle convention it has the plant's. Without a
+            torque, and held at first, it is scored from its release.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
             used unchanged and scored from the first sample; by default estimated from a lead-in.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
@@ -148,8 +149,8 @@ def score(
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
-    if initial_state is None:
-        (recording,) = released([recording])
+    first = release(recording) if initial_state is None else 0
+    whole, recording = recording, recording[first:] if first else recording
     horizons = checked_lengths("horizons", horizons, 0)
     zero = None
     if zeroed:
@@ -162,16 +163,16 @@ def score(
             f"without a gap must be longer than the lead-in of {ZERO_IN if zero else LEAD_IN:g} s."
         )
     windows = {f"{h:g}": run for h in horizons if (run := simulator.windows(h)) is not None}
-    simulated = np.full_like(recording.q, np.nan)
+    simulated = np.full_like(whole.q, np.nan)
     for run in runs:
-        simulated[run.samples] = run.q - (0.0 if zero is None else zero.offset)
+        simulated[first:][run.samples] = run.q - (0.0 if zero is None else zero.offset)
     return Score(
         RMSE.of(np.concatenate([run.error for run in runs], axis=1)),
         {horizon: RMSE.of(run.error) for horizon, run in windows.items()},
         Errors(_bound(runs), {horizon: _bound([run]) for horizon, run in windows.items()})
         if limit else None,
-        recording.name,
-        recording.time,
+        whole.name,
+        whole.time,
         simulated,
         min(run.diverged_at for run in runs),
         None if zero is None else tuple(zero.offset.tolist()),

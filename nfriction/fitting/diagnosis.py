@@ -199,6 +199,7 @@ def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mi
         step[gaps(recording.time)] = 0.0
         before, at, after = step[:-2], step[1:-1], step[2:]
         far = np.fmax(np.ptp(recording.q, axis=0) / 2, 2 * (np.abs(before) + np.abs(after)))
+        far = np.fmax(far, options.spike_ratio * np.median(np.abs(step), axis=0))
         back = (at * before < 0) & (at * after < 0) & (np.abs(at) > far)
         for joint, jump in zip(recording.names, (back * np.abs(at)).max(0), strict=True):
             if jump:
@@ -560,7 +561,7 @@ def _corrected_torques(
         # The gain is estimated together with the friction, which would bias a ratio of torques.
         without = replace(given, tau=given.tau - part)
         gain = _balance(without, without.tau - given.needed(plant), part)[1]
-        if abs(gain - 1) > options.gain_term[0]:
+        if gain and abs(gain - 1) > options.gain_term[0]:
             # Three digits, but 1000 and not 1e+03.
             times = f"{float(f'{1 / gain:.3g}'):g} times too large"
             wrong = f"is {times} (a unit, torque constant or gear ratio)"

@@ -47,12 +47,14 @@ def count_seen(q: ArrayLike) -> Array:
     found = np.full(q.shape[-1], np.nan)
     for joint in range(q.shape[-1]):
         least = ROUNDING * np.ptp(q[..., joint])
-        change = np.abs(np.diff(q[..., joint], axis=-1))
-        if (change > least).all():
-            change = np.abs(np.diff(q[..., joint], n=2, axis=-1))
-        moved = change[change > least]
-        if len(moved) and np.mean(moved <= (1 + ALIKE) * moved.min()) >= REPEATED:
-            found[joint] = moved.min()
+        for n in (1, 2):
+            change = np.abs(np.diff(q[..., joint], n=n, axis=-1))
+            moved = change[change > least]
+            # A joint that never stops, or a smooth motion, changes by more than a count each time.
+            if 0 < len(moved) < change.size:
+                if np.mean(moved <= (1 + ALIKE) * moved.min()) >= REPEATED:
+                    found[joint] = moved.min()
+                break
     return found
 
 

@@ -179,6 +179,20 @@ def test_a_hold_before_the_release_changes_no_fit_and_no_score():
     torch.testing.assert_close(
         found.model.schedule.values, expected.model.schedule.values, rtol=0.02, atol=1e-5
     )
-    with pytest.warns(UserWarning, match="held or pushed"):
-        of_late = score(plant, truth, late, limit=False)
-    assert of_late.free_run.all < 2e-3
+    scored = score(plant, truth, late, limit=False)
+    assert scored.free_run.all < 2e-3
+    # In line with the recording, for figures.
+    assert scored.simulated.shape == late.q.shape
+    assert np.isnan(scored.simulated[:240]).all()
+
+
+@pytest.mark.parametrize("start", [1e-3, 1e-2])
+def test_a_slow_start_near_upright_is_no_hold(start):
+    slow = swing(one_link(), CVFM(1, [1e-6, 1e-4]), seconds=4.0, start=(start,))
+    assert released([slow])[0] is slow
+
+
+def test_a_release_in_the_last_samples_is_left_alone():
+    time = 2e-3 * np.arange(500)
+    late = Recording(time, np.maximum(0.0, time - time[-4])[:, None])
+    assert released([late])[0] is late

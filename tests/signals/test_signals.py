@@ -393,6 +393,7 @@ def test_a_count_is_seen_where_changes_repeat():
     assert np.isnan(count_seen(smooth)).all()
     assert np.isnan(count_seen(smooth.round(9))).all()
     assert np.isnan(count_seen(np.zeros((9, 2)))).all()
+    assert np.isnan(count_seen((60 * time - 2.5 * time**2)[:, None])).all()
     read = quantise(smooth, 8192)
     quantum = 2 * np.pi / 8192
     # Turned into other coordinates and back, or written with few digits.

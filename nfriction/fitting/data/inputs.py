@@ -32,7 +32,7 @@ from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
-from nfriction.recording.validation import gaps
+from nfriction.recording.validation import MINIMUM_SAMPLES, gaps
 from nfriction.signals import Motion, count_seen, kalman_smoother
 from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
@@ -186,31 +186,41 @@ def released(recordings: Sequence[Recording]) -> list[Recording]:
     """
     found = []
     for recording in recordings:
-        time = _release(recording)
-        if time:
+        first = release(recording)
+        if first:
+            time = recording.time[first] - recording.time[0]
             warnings.warn(
                 f"{recording.name or 'a recording'} has no torque, and rests for {time:.3g} s "
                 "before it moves, so it was held or pushed; it is used from its release.",
                 stacklevel=1,
             )
-        found.append(recording[recording.time - recording.time[0] >= time] if time else recording)
+        found.append(recording[first:] if first else recording)
     return found
 
 
-def _release(recording: Recording) -> float:
-    """Time of the release of a mechanism without torque that was held at first [s], else 0."""
-    extent = np.ptp(recording.q, axis=0)
-    if (recording.tau is not None and recording.tau.any()) or not extent.any():
-        return 0.0
-    since = recording.time - recording.time[0]
-    away = np.abs(recording.q - recording.q[0])[:, extent > 0] / extent[extent > 0]
+def release(recording: Recording) -> int:
+    """First sample after the release of a mechanism without torque that was held at first, or 0."""
+    q, since = recording.q, recording.time - recording.time[0]
+    extent = np.ptp(q, axis=0)
+    # Joints whose encoder resolves the first part of the motion.
+    seen = extent * RELEASED[0] > 2 * np.nan_to_num(count_seen(q))
+    if (recording.tau is not None and recording.tau.any()) or not seen.any():
+        return 0
+    away = np.abs(q - q[0])[:, seen] / extent[seen]
     early, late = (since[(away >= share).argmax(0)] for share in RELEASED)
     # The joint that moves first. Its acceleration is constant at first, so that it takes twice the
     # time for four times the way.
-    first = early.argmin()
-    error = 3 * recording.sample_time + (late - early)[first] / 4
-    time = float(2 * early[first] - late[first])
-    return time if time > error else 0.0
+    k = early.argmin()
+    time = 2 * early[k] - late[k]
+    rest = q[since < 0.8 * time]
+    # Near an unstable equilibrium a joint leaves slowly, but not as from a rest.
+    moves = (
+        np.ptp(rest, axis=0) > 2 * np.ptp(rest[: len(rest) // 2], axis=0) if len(rest) > 3 else True
+    )
+    error = 3 * recording.sample_time + (late[k] - early[k]) / 4
+    first = int(np.searchsorted(since, time))
+    short = len(recording) - first < MINIMUM_SAMPLES
+    return 0 if time <= error or short or np.any(moves) else first
 
 
 def require_drive(law: Law, recordings: Sequence[Recording]) -> None:

@@ -44,12 +44,13 @@ class ExtrapolationPrior:
         network = cast("NeuroFuzzy", schedule)
         by, factor = network.sensitivities(self.qd, self.qdd), self._factor(network)
         r = self.residuals(network).view_as(factor)
-        slopes, count = by.parameters, len(by.joint)
+        slopes, joint = by.parameters, by.joint
+        count = len(joint)
         gradient = torch.zeros(count, dtype=torch.float64)
         hessian = torch.zeros(count, count, dtype=torch.float64)
         # No parameter affects two joints.
         for j in range(network.joints):
-            own = (by.joint == j).nonzero().squeeze(-1)
+            own = (joint == j).nonzero().squeeze(-1)
             active = self.weight[:, j] > 0
             rows = (slopes[active][..., own] * factor[active, j, :, None]).flatten(0, 1)
             gradient[own] = r[active, j].flatten() @ rows
