@@ -444,7 +444,7 @@ def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator
 
 
 def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
-    """A sentence if test recordings are faster than all training recordings, or turn otherwise."""
+    """A sentence if tests are faster than all training, or move in a direction without training."""
     fastest, found = np.max([np.abs(m.qd).max(0) for m in train.motions], axis=0), []
     for sign in (1, -1):
         trained = np.max([_usual_speed(m, sign) for m in train.motions], axis=0) > 0
@@ -466,7 +466,7 @@ def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
 
 
 def _usual_speed(motion: Motion, sign: int) -> np.ndarray:
-    """Speed in a direction that most samples do not exceed, (joint,) [rad/s; m/s]."""
+    """Speed in a direction that all but 1 % of the samples stay below, (joint,) [rad/s; m/s]."""
     # Pure noise exceeds other pure noise in half of all cases.
     noise = 0.0 if motion.std is None else 2.0 * motion.std.qd
     return np.quantile(sign * motion.qd - noise, 1.0 - FASTER, axis=0)

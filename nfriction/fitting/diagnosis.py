@@ -211,6 +211,7 @@ def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mi
         q, time = (sliding_window_view(x, 6, axis=0) for x in (recording.q, recording.time))
         steps = np.diff(q)
         noise = np.median(np.abs(np.diff(recording.q, n=2, axis=0)), axis=0)
+        noise = np.fmax(noise, count_seen(recording.q))
         even = np.ptp(np.diff(time), axis=-1) < ALIKE * recording.sample_time
         for factors, rows, remedy in (
             ([2], "are missing", "use the logger's own time stamps"),
@@ -221,8 +222,7 @@ def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mi
             others = np.delete(steps, broken, -1)
             mean, apart = others.mean(-1), np.ptp(others, axis=-1)
             size = np.abs(mean)
-            seen = size * ALIKE > np.fmax(noise, count_seen(recording.q))
-            seen &= (apart < ALIKE * size) & even[:, None]
+            seen = (size * ALIKE > noise) & (apart < ALIKE * size) & even[:, None]
             # A row is lost for all joints. Noise causes half of this error more often.
             found, half = (
                 int((seen.any(1) & ((error < ALIKE * size) | ~seen).all(1)).sum())

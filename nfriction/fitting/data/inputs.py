@@ -212,15 +212,14 @@ def release(recording: Recording) -> int:
     # time for four times the way.
     k = early.argmin()
     time = 2 * early[k] - late[k]
-    rest = q[since < 0.8 * time]
-    # Near an unstable equilibrium a joint leaves slowly, but not as from a rest.
-    moves = (
-        np.ptp(rest, axis=0) > 2 * np.ptp(rest[: len(rest) // 2], axis=0) if len(rest) > 3 else True
-    )
-    error = 3 * recording.sample_time + (late[k] - early[k]) / 4
     first = int(np.searchsorted(since, time))
-    short = len(recording) - first < MINIMUM_SAMPLES
-    return 0 if time <= error or short or np.any(moves) else first
+    error = 3 * recording.sample_time + (late[k] - early[k]) / 4
+    rest = q[since < 0.8 * time]  # not yet the first motion, in spite of errors of the time
+    if time <= error or len(rest) < 4 or len(recording) - first < MINIMUM_SAMPLES:
+        return 0
+    # Near an unstable equilibrium a joint leaves slowly, but not as from a rest.
+    moves = np.ptp(rest, axis=0) > 2 * np.ptp(rest[: len(rest) // 2], axis=0)
+    return 0 if moves.any() else first
 
 
 def require_drive(law: Law, recordings: Sequence[Recording]) -> None:
