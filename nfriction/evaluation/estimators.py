@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfriction.evaluation.lead_in import ZERO_IN, longest_window
 from nfriction.evaluation.score import score
-from nfriction.fitting.data.inputs import require_drive
+from nfriction.fitting.data.inputs import release, require_drive
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.memory import deflections, load_of
@@ -225,7 +225,8 @@ class FrictionEstimator(BaseEstimator):
             y: ignored.
         """
         errors = []
-        for recording in _recordings(X, self.plant_):
+        for given in _recordings(X, self.plant_):
+            recording = given[release(given) :]
             zeroed, room = bool(self._fitted.encoder_offsets), longest_window(recording)
             # A short recording is scored from the end of its lead-in.
             horizon = min(self.horizon, max(room - ZERO_IN, room / 2) if zeroed else room)

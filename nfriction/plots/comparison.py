@@ -393,7 +393,8 @@ def _figures(
         moved = tuple(replace(m, q=m.q + offset) for m, offset in pairs)
     order = [s.recording for s in next(iter(comparison.train.values()))]
     trained = dict(zip(order, moved, strict=True))
-    given = [r for r in recordings if r.name in trained]
+    # A mechanism that was held at first is fitted from its release.
+    given = [r[r.time >= trained[r.name].time[0]] for r in recordings if r.name in trained]
     models = {name: found.model for name, found in comparison.fits.items()}
     if given:
         motions = [trained[r.name] for r in given]

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, PendulumChain, Recording, fit, rollout, score
+from nfriction import (
+    CVFM,
+    FrictionEstimator,
+    PendulumChain,
+    Recording,
+    compare,
+    fit,
+    plots,
+    rollout,
+    score,
+)
 from nfriction.fitting.data.inputs import released
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.signals import Motion, quantise
@@ -184,6 +194,22 @@ def test_a_hold_before_the_release_changes_no_fit_and_no_score():
     # In line with the recording, for figures.
     assert scored.simulated.shape == late.q.shape
     assert np.isnan(scored.simulated[:240]).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*held or pushed")
+def test_figures_and_estimators_take_a_recording_that_was_held(tmp_path):
+    plant = one_link()
+    whole = swing(plant, CVFM(1, [5e-3, 1e-3]), seconds=2.0)
+    rows = np.r_[np.zeros(500, int), 0 : len(whole)]
+    time = 2e-3 * np.arange(len(rows))
+    held = Recording(time, whole.q[rows], convention=whole.convention, name="held")
+    settings = {"windows": (0.5,), "max_steps": 5}
+    found = compare(plant, "CVFM", held, horizons=(0.5,), **settings)
+    drawn = {path.stem for path in plots.save_all(found, [held], tmp_path)}
+    assert {"positions_train_held", "torque_over_velocity"} <= drawn
+    estimator = FrictionEstimator(plant, "CVFM", **settings).fit([held])
+    assert len(estimator.simulate(held)) == len(held)
+    assert -0.02 < estimator.score([held]) < 0.0
 
 
 @pytest.mark.parametrize("start", [1e-3, 1e-2])
