@@ -64,12 +64,16 @@ class Mistake:
 class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
 
-    `time` counts from the start of a recording [s], (sample, 1), and `number` the recordings.
+    `sd` is that of the smoothed accelerations [rad/s²] and `sd_of_mean` that of their block means,
+    zero if they are unknown. `time` counts from the start of a recording [s], (sample, 1), and
+    `number` the recordings.
     """
 
     q: Tensor
     qd: Tensor
     qdd: Tensor
+    sd: Tensor
+    sd_of_mean: Tensor
     tau: Tensor
     time: Tensor
     number: Tensor
@@ -119,7 +123,8 @@ def likely_mistakes(
 
     Returns:
         The share [-], and the mistakes that the data support, best first: several if the data do
-        not distinguish them, none if no correction divides the share by `diagnosis_ratio`.
+        not distinguish them, none if no correction divides the share by `diagnosis_ratio`, or if
+        the share is at most this times that of the noise.
     """
     given = _collect(recordings, motions, options)
     # These spoil the balance, and a fit absorbs some wrong times in the inertia.
@@ -128,11 +133,12 @@ def likely_mistakes(
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
+    noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd_of_mean)
     # Inertias or torques wrong by the square of a thousand would have the same effect.
     if unit := time_unit(recordings[0].time):
         short, _, rate = unit
         share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
-        if share < stated / options.diagnosis_ratio:
+        if noise < stated and share < stated / options.diagnosis_ratio:
             return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
     if stops := [*_end_stops(plant, recordings, given, options)]:
@@ -160,7 +166,7 @@ def likely_mistakes(
     least = min((share for _, share in tested), default=math.inf)
     rare = *_springs(plant, given), *_geared(plant, convention, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
-    explain = [x for x in tested if x[1] < sound / options.diagnosis_ratio]
+    explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
     found = [Mistake(text, share) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
@@ -279,10 +285,13 @@ def _tested(
             yield text, _unexplained(plant, data)
         yield delay_in_words(delay[0]), delay[1]
         yield _drifting_clock(plant, recordings, motions, options)
-        step = recordings[0].sample_time
         drives = *_saturated(plant, given), *_switched_off(plant, recordings, given)
-        for text, data in (*drives, *_elastic(plant, given, step)):
+        for text, data in drives:
             yield text, _unexplained(plant, data)
+        # Narrow-band noise of the smoothed accelerations has a resonance of its own.
+        noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd)
+        if noise < _unexplained(plant, given):
+            yield from _elastic(plant, given, recordings[0].sample_time)
     for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)
 
@@ -409,10 +418,15 @@ def _collect(
         since = stamps[at] - stamps[0]
         torque = recording.torque_at(stamps[at] + delay + drift * since)
         of = since[:, None], np.full((len(at), 1), k)
-        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], torque, *of))
+        sd = sd_of_mean = 0 * torque
+        if motion.std is not None:
+            sd = motion.std.qdd[at]
+            # A mean acceleration is a difference of velocities, too.
+            over = max(1, block - 1) * recording.sample_time
+            sd_of_mean = np.minimum(sd, math.sqrt(2) / over * motion.std.qd[at])
+        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], sd, sd_of_mean, torque, *of))
     found = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    q, qd, qdd, tau, time, number = found
-    return _Data(q, qd, qdd, tau, time, number, block)
+    return _Data(*found, block)
 
 
 def _corrected_positions(
@@ -668,7 +682,7 @@ def _end_stops(
             yield Mistake(f"{text}, which the rig lacks (cut these parts off)", math.nan)
 
 
-def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:
+def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, float]]:
     """Each driven joint with a spring between the inertia of its drive and the link.
 
     The drive's inertia B then takes, in addition to the torque of a rigid joint, B/k times that
@@ -693,7 +707,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Da
                 f"(resonance near {1 / (math.tau * math.sqrt(ratio)):.2g} Hz), which a rigid rig "
                 "cannot follow"
             )
-            yield text, replace(given, tau=given.tau - ratio * part)
+            yield text, _unexplained(plant, given, part)
 
 
 def changing_friction(
@@ -938,8 +952,20 @@ def _unexplained(plant: Plant, data: _Data, extra: Tensor | None = None) -> floa
     Root mean square over joints, relative to the sum of squares of the torques of drive, gravity
     and inertia, without their means where a drive may have an offset.
     """
+    return _share(plant, data, _balance(data, data.tau - data.needed(plant), extra)[0])
+
+
+def _of_noise(plant: Plant, data: _Data, sd: Tensor) -> float:
+    """Share of the torque that its noise, and that of accelerations, explains [-]."""
+    steps = data.tau.reshape(-1, data.block, plant.joints).diff(dim=1)
+    white = steps.square().sum(1) / (2 * max(1, data.block - 1))
+    needed = data.mean(plant.mass_matrix(data.q).square() @ sd.square()[..., None])[..., 0]
+    return _share(plant, data, (data.moving * (white / data.block + needed)).mean(0))
+
+
+def _share(plant: Plant, data: _Data, target: Tensor) -> float:
+    """Mean squares of torques, (joint,), as a share of the torque [-]; see `_unexplained`."""
     needed, rest = data.needed(plant), torch.zeros_like(data.q)
-    target = _balance(data, data.tau - needed, extra)[0]
     static = plant.inverse_dynamics(data.q, rest, rest)
     parts = torch.stack([data.mean(x) for x in (data.tau, static, needed - static)])
     # The offset of a drive would explain a constant torque of any size.

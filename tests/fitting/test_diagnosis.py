@@ -364,6 +364,16 @@ def test_a_spring_that_the_rig_lacks_is_named(name, stiffness):
     assert warnings_of(plant, q, tau) == ()
 
 
+@pytest.mark.parametrize("inertia", [0.002, 0.02, 2.0])
+def test_rounding_at_a_steady_speed_is_no_mistake(inertia):
+    """Dry friction and an offset explain a constant torque, so that only noise remains."""
+    time, torque = STEP * np.arange(SAMPLES), 0.3
+    settling = inertia / 0.02  # From rest, with dry friction of 0.1 and viscous friction of 0.02.
+    q = 10 * (time + settling * np.expm1(-time / settling))[:, None]
+    q = COUNT * np.round(q / COUNT)
+    assert warnings_of(Rotor(inertia), q, np.full_like(q, torque)) == ()
+
+
 @pytest.mark.parametrize(("times", "named"), [(2, "repeated"), (0, "missing")])
 def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
     """A fit absorbs most of a wrong clock in the inertia, and seems good."""
