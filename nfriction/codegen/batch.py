@@ -135,7 +135,6 @@ class Driver:
     slot for each of the rows that are computed together.
 
     Args:
-        layout: its arguments.
         width: number of rows computed together as vectors, which share all parameters; 0 for one.
         sizes: elements of each array in the workspace.
         once: nodes computed once, with one slot each.
@@ -253,7 +252,6 @@ class Kernel:
 
     Args:
         write: returns the driver for a number of rows computed together, 0 for one at a time.
-        layout: its arguments.
     """
 
     def __init__(self, write: Callable[[int], Driver], layout: Layout) -> None:
@@ -273,7 +271,6 @@ class Kernel:
         """Fill the outputs.
 
         Args:
-            rows: number of rows in the batch.
             parameters: (row, value), or a single row for all.
             given: series by name; the code must not read one that is omitted.
             outputs: contiguous arrays to write to, by name.

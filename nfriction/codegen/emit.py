@@ -31,8 +31,6 @@ def write_function(
     """Write a function of arrays.
 
     Args:
-        body: the module.
-        name: of the function.
         outputs: nodes, by the name of the array to which they are written.
         places: array and index of each given node.
         shared: names of the arrays that never change and have one number per element.

@@ -271,9 +271,6 @@ class FunctionalModule:
     Integer and boolean buffers remain constants: they index and select, so they must be known when
     code is emitted.
 
-    Args:
-        module: whose `forward` is traced.
-
     Attributes:
         shapes: of these parameters and buffers, by their names in the module.
     """

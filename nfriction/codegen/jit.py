@@ -63,7 +63,6 @@ def build(source: str, name: str) -> Callable[..., None]:
     It takes two integers and three addresses, as written by `Driver.entry`.
 
     Args:
-        source: the module.
         name: of the function, which returns nothing.
     """
     from llvmlite import binding as llvm  # slow to import

@@ -51,11 +51,9 @@ class Candidate:
     """Errors of one model on blocks that its fits had not seen.
 
     Attributes:
-        name: of the model.
         errors: root mean square position error of each block [rad or m], infinite where the model
             diverged or could not be fitted; blocks in the same order for all candidates.
         parameters: number of fitted parameters of the friction model.
-        converged: whether every fold's fit converged.
     """
 
     name: str
@@ -74,11 +72,8 @@ class Selection:
     """Models compared by cross-validation, and the one to choose.
 
     Attributes:
-        chosen: name of the model.
-        reason: for the choice, in a sentence.
         candidates: all models, in the order given.
         horizon: length of the scored simulations [s].
-        unit: of the errors.
     """
 
     chosen: str
@@ -139,7 +134,6 @@ def select(
 
     Args:
         plant, models, progress, jobs, fit_settings: as in `compare`.
-        recordings: training recordings.
         folds: at least 2.
         horizon: length of the simulations [s], or of a shorter block.
 
@@ -241,7 +235,6 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
 
     Args:
         candidates: with errors on the same blocks.
-        unit: of the errors.
     """
 
     def error(candidate: Candidate) -> str:

@@ -219,10 +219,6 @@ class FrictionEstimator(BaseEstimator):
         Simulations last `horizon` seconds (or as long as a shorter recording) and are restarted
         from the measured motion, see `nfriction.score`. Higher is better, 0 is perfect, a diverged
         simulation gives -inf.
-
-        Args:
-            X: recordings to score.
-            y: ignored.
         """
         errors = []
         for given in _recordings(X, self.plant_):

@@ -395,7 +395,6 @@ def estimate_starts(
         time: of the samples [s], (window, sample).
         y: measured positions, (window, sample, joint).
         quantum: one count of the encoders, a number or (joint,); 0 where unknown.
-        draws: number of deviations.
     """
     count = y.shape[1]
     time = time - time[:, :1]

@@ -122,12 +122,9 @@ def write_results(
     first file of this run appears; `results.json` comes last. The user's own files stay.
 
     Args:
-        comparison: fits and scores.
-        train, test: their recordings.
         folder: made if it does not exist.
         selection: the choice on the training recordings alone, if there is one.
         command: command line that reproduces the results.
-        figures: draw them.
         formats: of figures besides PNG, see `plots.save_all`.
 
     Raises:

@@ -86,7 +86,6 @@ class Score(Errors):
         limit: errors caused by uncertain initial states and encoder zeros and by noise of the
             torque, in simulations of this model; None if not requested. The true model stays below
             in at least 95 of 100 recordings; smaller differences between models are not meaningful.
-        recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
         diverged_at: time at which the free run diverged [s], infinity if it did not. Friction

@@ -40,8 +40,6 @@ class SessionFit(NamedTuple):
         values: of the coefficients and plant terms, by name.
         sd: their standard deviations; infinite where the session does not determine them.
         residual: root mean square position error of its windows [rad; m].
-        status: of its fit.
-        warnings: of its fit.
     """
 
     values: dict[str, float]
@@ -56,8 +54,6 @@ class Spread:
     """A parameter over all sessions.
 
     Attributes:
-        name: of the parameter.
-        mean: over sessions.
         between: standard deviation between sessions, beyond what their own errors explain.
         low, high: 95 % confidence interval of the mean.
         next_low, next_high: 95 % prediction interval of the next session's value.
@@ -79,9 +75,7 @@ class SessionsResult:
     """Friction of a machine over its sessions.
 
     Attributes:
-        model: with the mean coefficients.
         spreads: mean, spread and intervals of each parameter.
-        fits: estimates by session.
         failed: reason by session that could not be fitted.
     """
 
@@ -193,7 +187,6 @@ def random_effects(name: str, values: Array, sd: Array) -> Spread:
     the number of estimates less one.
 
     Args:
-        name: of the parameter.
         values: one estimate per session.
         sd: its standard deviations; sessions with an infinite one do not count.
     """

@@ -37,7 +37,6 @@ class Table:
     Attributes:
         caption: without a full stop.
         columns: headings; a comma separates a group of columns from the column's own name.
-        rows: text and numbers.
         infinite: word for an infinite number.
         marked: indices of columns whose smallest number is marked.
         limit: a last row with the differences that are not meaningful; empty if unknown.
@@ -155,8 +154,6 @@ def coefficient_table(
     Joints are rows; many constants, as of a law with memory, are rows themselves.
 
     Args:
-        model: its name.
-        joints: names.
         sets: by range of validity (`"always"` for constants), then by name: one value per joint.
         units: by name of the coefficient, as far as they are known.
     """

@@ -62,8 +62,6 @@ class TorqueScore(NamedTuple):
     """Error of a predicted friction torque at one joint.
 
     Attributes:
-        joint: its name.
-        model: name of the model.
         rmse: root mean square error [N m; N].
         nrmse: the same over the standard deviation of the torque [-].
     """
@@ -79,7 +77,6 @@ class TorqueFits:
     """Friction models fitted to a table of friction torque, and the one to use at each joint.
 
     Attributes:
-        table: the rows.
         fits: by name of the model, one per joint in the table's order.
         candidates: errors on blocks left out, by joint: root mean square torque [N m; N].
         choices: model to use and the reason, by joint.
@@ -293,7 +290,6 @@ def fit_torque(
         models: names, comma-separated or in a list; by default all constant laws that the table's
             columns allow.
         folds: number of hold-out blocks, at least 2.
-        options: tuning constants.
         progress: called with each stage.
         reading: `columns`, `degrees` and `unit`, see `TorqueTable.from_pandas`.
 

@@ -53,7 +53,6 @@ def c(
     schedule is written as its traced operations.
 
     Args:
-        model: a friction model.
         folder: to write into; made if missing. The same model gives the same bytes.
         info: description of the model besides its parameters. With its rig, C of a law that reads
             the load has a function `<name>_load(q, qd, load)` for it.

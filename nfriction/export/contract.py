@@ -289,8 +289,6 @@ def contract_of(
     """Make the contract of a controller, with its test vectors.
 
     Args:
-        model, info: from which the controller was made.
-        controller: to be exported.
         dtype: "float64" or "float32", in which the target computes.
 
     Raises:

@@ -92,14 +92,12 @@ class Controller(nn.Module):
 
     Args:
         model, info, torque_limit: see `controller_of`.
-        low_pass: the filter.
 
     Shape:
         Inputs (*batch, joint), state (*batch, joint, state_size); torque (*batch, joint),
         coefficients (*batch, joint, coefficient), status (*batch, joint), int32.
 
     Attributes:
-        inputs: names of the inputs.
         state_size: numbers per joint that it carries from sample to sample, those of the filter
             before those of the schedule.
         memory_size: those of the schedule alone.

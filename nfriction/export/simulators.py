@@ -31,7 +31,6 @@ class DampingFit:
     """Damping and friction loss closest to a model.
 
     Attributes:
-        joint_names: in the order of the joints.
         damping: [N m s/rad], (joint,).
         frictionloss: [N m], (joint,).
         rms_torque: of the model along the motion [N m], (joint,).
@@ -86,7 +85,6 @@ def fit_damping_frictionloss(
     """Fit damping and friction loss to a model by least squares over the samples of a motion.
 
     Args:
-        model: a friction model.
         motions: in joint coordinates; every sample has the same weight.
         load: normal load at positions and velocities (sample, joint), such as `Plant.load`; 1 by
             default.
@@ -129,7 +127,6 @@ def mjcf(
     attribute `lugre` is the friction (MuJoCo 4.0).
 
     Args:
-        model: a friction model.
         path: XML file to write; missing folders are made.
         motions, load: see `fit_damping_frictionloss`.
         info: names of the joints, by which they are found in `patch`.

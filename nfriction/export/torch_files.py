@@ -65,7 +65,6 @@ def torchscript(
     again and compared with the model before it is put in place.
 
     Args:
-        model: a friction model.
         path: file to write, usually `.pt`; missing folders are made.
         info: description of the model besides its parameters.
         torque_limit, with_filter, cutoff_hz: see `controller_of`.

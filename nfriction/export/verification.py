@@ -73,7 +73,6 @@ def verify_artefact(
         model: the model, as loaded from its file.
         info: the model file's description of the model; the sample time is the artefact's.
         points: number of random points; at most 2,000 if the controller has a state.
-        seed: of the random points.
 
     Raises:
         ExportError: if it is not an artefact, its program is not the model's, or it cannot be run.

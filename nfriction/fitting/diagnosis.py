@@ -118,7 +118,6 @@ def likely_mistakes(
         recordings: in joint coordinates.
         motions: of the recordings, smoothed.
         convention: of the recorded angles.
-        options: `diagnosis_ratio` and related settings.
         zeroed: encoders were set to zero at the start of each recording, in any pose.
 
     Returns:

@@ -34,7 +34,6 @@ def plant_parameters(
         drag: fit air drag on the links: one quadratic coefficient for all; with several links also
             a linear one, and the length of the last link in the air.
         eccentricity: fit the eccentricity of the encoders, two numbers per link.
-        options: bounds and priors.
 
     Returns:
         Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque gains of

@@ -34,13 +34,9 @@ class FitTask:
         recordings: in joint coordinates.
         measurement: matrix from joint to recorded coordinates, see `measurement_matrix`.
         motions: smoothed motion of each recording, in joint coordinates.
-        options: settings of the fit.
-        start: an earlier fit to start from.
         callback: `callback(stage, step)` after every step, a name and a `Step`; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
         delay: of the torque after the positions from the balance of torques [s]; 0 unless fitted.
-        data_warnings: warnings about the recordings.
-        mistakes: likely mistakes in recordings or plant.
         drift, play: those of `data_warnings` on changes of friction and on play of gears.
     """
 

@@ -48,7 +48,6 @@ class JointFit:
         unidentifiable: coefficients, or combinations `"a with b"`, that the rows do not determine.
         root: R of the covariance R R^T of the model's parameters, (parameter, any).
         residual: root mean square of the unexplained torque [N m; N].
-        converged: whether the search ended at a minimum.
     """
 
     model: FrictionModel
@@ -140,8 +139,6 @@ def fit_network(
     """Train the network of a neuro-fuzzy model that `fit_joint` set to its constant law.
 
     Args:
-        constant: of the same rows.
-        joint: the rows.
         share: of the schedule's prior standard deviation.
     """
     model = copy.deepcopy(constant.model)

@@ -30,10 +30,6 @@ class Schedule(nn.Module, ABC):
     simulation or controller calls `advance` (at the first `initial_state`), then
     `coefficients_from`, and holds these coefficients until the next sample.
 
-    Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
-
     Attributes:
         coefficient_names: names of the last axis.
         fitted_mask: which coefficients are estimated by default.

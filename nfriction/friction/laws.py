@@ -110,7 +110,6 @@ class Law:
     """A friction law: its torque function and a description of its coefficients.
 
     Attributes:
-        name: name of the law.
         coefficients: in the order of the coefficients' last axis.
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable; for a
             law with memory, the steady-state torque at constant velocity.

@@ -28,7 +28,6 @@ class FrictionModel(nn.Module):
     """Friction torque of the joints of a mechanism.
 
     Args:
-        law: the friction law.
         schedule: its coefficients as a function of the motion.
         v_smooth: velocity over which the sign of the velocity changes, `sgn(v) = tanh(v/v_smooth)`
             [rad/s; m/s for a sliding axis]; a fit of a model given by name chooses it itself.
@@ -151,7 +150,6 @@ class NamedModel(FrictionModel):
     """A law and a kind of schedule under one name.
 
     Args:
-        joints: number of joints.
         initial: start values in SI, shape (joint, coefficient) or (coefficient,).
         v_smooth: see `FrictionModel`.
         options: of the schedule, see its class.

@@ -66,8 +66,6 @@ class NeuroFuzzy(Schedule):
     Beyond the trained range the deviation tapers off to the constant law.
 
     Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
         initial: reference coefficients in SI, (joint, coefficient) or (coefficient,).
         terms: numbers of fuzzy sets of velocity and of acceleration.
         head_units: number of units of the radial basis head.

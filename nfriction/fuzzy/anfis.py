@@ -32,9 +32,7 @@ class Anfis(LinearOutputModule):
 
     Args:
         groups: independent layers of the same shape, e.g. one per joint.
-        inputs: number of inputs per group.
         terms: number of sets of each input.
-        outputs: number of outputs per group.
         order: 1 for linear consequents, 0 for constant ones.
         kind: "gaussian", or "bell" for generalised bells.
         interpretable: keep the sets ordered, in range and crossing at a membership of 0.5 or more.

@@ -26,7 +26,6 @@ class RBFNetwork(grouped.LinearOutputModule):
     Args:
         groups: independent networks of the same shape, e.g. one per joint.
         inputs, units, outputs: the paper's network is 2-10-2.
-        seed: for the initial centres and weights.
 
     References:
         Moody and Darken (1989), Fast learning in networks of locally-tuned processing units.
@@ -178,7 +177,6 @@ class RBFNetwork(grouped.LinearOutputModule):
 
         Args:
             lower, upper: range of each input, broadcastable to (groups, inputs).
-            seed: of the random draw.
         """
         low, high = grouped.input_range(lower, upper, self.centres[:, 0].detach())
         low, span = low.unsqueeze(1), (high - low).unsqueeze(1)
@@ -193,7 +191,6 @@ class RBFNetwork(grouped.LinearOutputModule):
 
         Args:
             x: samples, shape (*batch, groups, inputs).
-            seed: of the k-means++ start.
         """
         samples = self._samples(x)
         for group in range(self.groups):
@@ -253,7 +250,6 @@ class AnfisRBF(nn.Module):
     Args:
         groups, inputs, terms, outputs: of the layer, see `Anfis`.
         units: of the head.
-        seed: for the initial centres of the head.
         options: of the layer: order, kind, interpretable, dtype.
     """
 
@@ -286,7 +282,6 @@ class AnfisRBF(nn.Module):
 
         Args:
             lower, upper: range of each input, broadcastable to (groups, inputs).
-            seed: of the head's centres.
         """
         self.anfis.init_grid(lower, upper)
         centres = self.head.centres[:, 0].detach()

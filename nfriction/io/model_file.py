@@ -170,7 +170,6 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
     """Write a model to one JSON file, atomically.
 
     Args:
-        model: a friction model.
         path: file to write; an existing one is replaced, missing folders are made.
         info: facts about the model besides its parameters.
 

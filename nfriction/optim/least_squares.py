@@ -94,7 +94,6 @@ class LeastSquaresResult:
         gradient: at `x`, shape (p,), not projected.
         hessian: Gauss-Newton Hessian at `x`, shape (p, p).
         status: reason why the search ended; `message` describes it in words.
-        steps: accepted steps.
         evaluations: costs evaluated, including rejected trials.
         at_lower, at_upper: which parameters lie on a bound, shape (p,), bool.
         history: one `Step` per accepted step.

@@ -54,7 +54,6 @@ class LevenbergMarquardt:
     All tests use units of D, so that a fit does not depend on the units of its parameters.
 
     Args:
-        max_steps: limit on accepted steps.
         gradient_tolerance: largest cosine between the residual and a free Jacobian column.
         cost_tolerance: relative decrease of the cost (predicted and actual) that counts as zero.
         step_tolerance: ratio of step to parameters, both scaled, that counts as zero.

@@ -73,7 +73,6 @@ class Plant(nn.Module, ABC):
     Fits can adjust terms of `PendulumChain` and `LinearAxis` only.
 
     Args:
-        joints: number of joints.
         joint_names: one per joint; None for joint1, joint2, ...
         name: of the mechanism, in tables and files.
         unit: of a position, "rad" or "m".

@@ -181,7 +181,6 @@ def horizon_curve(
     smaller differences between models are not meaningful.
 
     Args:
-        comparison: fits and scores.
         part: `"test"` or `"train"`; by default test recordings if there are any.
         column: joint of the tables, or `"all"`.
     """
@@ -322,7 +321,6 @@ def save_all(
     rejected network has constant coefficients and none of these.
 
     Args:
-        comparison: fits and scores.
         recordings: those compared, or some of them.
         folder: made if it does not exist; files of the same name are replaced.
         run: id of the run, written into each PNG file.

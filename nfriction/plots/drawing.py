@@ -32,11 +32,7 @@ class _View(NamedTuple):
 
 
 def mechanism(plant: Plant) -> Figure:
-    """The mechanism in a pose near rest: links, joints, centres of mass, and their data.
-
-    Args:
-        plant: as given, or as fitted.
-    """
+    """The mechanism in a pose near rest: links, joints, centres of mass, and their data."""
     views = _views(plant)
     figure, axes = style.panels(
         1, len(views) + 1, style.PAGE, 2.8, width_ratios=[*[1.0] * len(views), 1.1]
@@ -80,11 +76,9 @@ def animate(
     """Write overlaid motions of a mechanism as a GIF, in real time.
 
     Args:
-        plant: the mechanism.
         time: [s], (time,).
         motions: positions in joint coordinates by name, (time, joint); "measured" is drawn broad
             and grey. A motion is hidden while it is not finite.
-        path: of the file.
         seconds: longest duration drawn.
     """
     from matplotlib.animation import FuncAnimation, PillowWriter  # slow to import

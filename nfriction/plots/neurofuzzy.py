@@ -38,9 +38,7 @@ def memberships(
     """Fuzzy sets of velocity and acceleration, one row per joint.
 
     Args:
-        model: a neuro-fuzzy model.
         before: the same model before its training, drawn dashed over the range of `model`.
-        joint_names: for the labels.
         unit: of a position, `"rad"` or `"m"`.
 
     Raises:
@@ -162,7 +160,6 @@ def coefficients_over_time(
         models: by name, with equally many joints; constant, adaptive or neuro-fuzzy.
         motion: in joint coordinates.
         law: name of the law whose models are drawn, each in its usual colour; by default all.
-        joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
 
     Raises:
@@ -225,12 +222,10 @@ def coefficient_surfaces(
     """Coefficients of a neuro-fuzzy model as maps over |velocity| and acceleration.
 
     Args:
-        model: a neuro-fuzzy model.
         motions: smoothed motions in joint coordinates. White lines enclose 50 % and 90 % of their
             samples; the map is hatched where there are no samples nearby.
         uncertainty: of its fit (`FitResult.uncertainty`). The map fades into the hatching as the
             standard deviation grows, to about half when it is half of the coefficient's mean size.
-        joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
 
     Returns:

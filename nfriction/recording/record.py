@@ -340,7 +340,6 @@ class Recording:
         file, without its ending.
 
         Args:
-            path: of the file.
             columns, degrees, convention, unit, name, plant: as for `from_pandas`.
         Warns:
             RecordingWarning: a guessed decimal sign; and as `from_pandas`.

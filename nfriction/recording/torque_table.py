@@ -55,7 +55,6 @@ class JointTorque:
     """Friction torque of one joint, row by row.
 
     Attributes:
-        name: of the joint.
         qd: velocity [rad/s; m/s], (row,).
         tau: friction torque, of the sign of the velocity [N m; N], (row,).
         time: increasing [s], (row,); None for unordered rows, such as constant-velocity tests.
@@ -96,7 +95,6 @@ class TorqueTable:
     Attributes:
         joints: rows of each joint, which need not be equally many.
         unit: of a position, `"rad"` or `"m"`.
-        name: of the table.
         remarks: doubts about the data, a sentence each.
     """
 

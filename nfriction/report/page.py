@@ -89,7 +89,6 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     (braking, speeding up) unless the model takes it signed.
 
     Args:
-        model: any friction model.
         joint_names: default joint1, joint2, ...
 
     Raises:

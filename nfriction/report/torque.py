@@ -59,10 +59,8 @@ def write_torque_fits(
     """Write `table.csv`, `results.json`, the models, a figure and `report.html` into a folder.
 
     Args:
-        fits: of a table.
         folder: made if it does not exist; files of these names are replaced.
         command: command line that reproduces the results.
-        figures: draw friction over velocity.
     """
     folder = Path(folder)
     written, drawn = [], []

@@ -38,7 +38,6 @@ class Electronics:
         delay: samples from reading the encoders to the resulting torque.
         torque_limit: largest |torque| of the drives [N m].
         torque_bits: of the digital-to-analogue converter over that range; None for exact torques.
-        substeps: integration steps per sample.
 
     Raises:
         ValueError: if a number is out of its range, or a converter has no torque limit.
@@ -116,7 +115,6 @@ def control(
         controller: called once per sample, in order, with time and encoder positions.
         q0, qd0: initial state [rad, rad/s] in joint coordinates, (*batch, joint).
         steps: samples after the first.
-        electronics: sample time, encoders, delay and drives.
 
     Returns:
         The motion; NaN after it diverged, as from `rollout`.

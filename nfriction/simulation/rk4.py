@@ -56,7 +56,6 @@ def rk4_step(
     """One Runge-Kutta step of fourth order with coefficients and torque held.
 
     Args:
-        plant, friction: the mechanism and its friction model.
         q, qd: state at the start of the step, (*batch, joint).
         tau: torque over the step, (*batch, joint).
         coefficients: held over the step, (*batch, joint, coefficient).

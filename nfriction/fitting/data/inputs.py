@@ -343,7 +343,6 @@ def apply_encoder_offsets(
 
     Args:
         offsets: `FitResult.encoder_offsets`, one row per recording; empty for no change.
-        plant: the mechanism.
         recordings: all in one convention.
         motions: of the recordings, in joint coordinates.
     """

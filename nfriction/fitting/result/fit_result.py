@@ -40,7 +40,6 @@ class InputGain:
     """Share of the squared error that an input explains.
 
     Attributes:
-        name: of the input.
         share: with all joints.
         by_joint: with each joint's coefficient alone, (joint,).
     """

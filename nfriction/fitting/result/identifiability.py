@@ -28,8 +28,6 @@ class Interval:
     """A fitted value and its 95 % confidence interval, within its bounds.
 
     Attributes:
-        name: of the parameter.
-        value: as fitted.
         low, high: limits; at most the bounds, infinite where the data determine nothing.
     """
 

@@ -59,7 +59,6 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
     Args:
         residuals: [rad; m], shape (window, sample, joint), like the result.
         band: see `bandwidth` [cycles per sample].
-        options: tuning constants.
 
     References:
         W. K. Newey, K. D. West, Econometrica 55 (1987), 703-708.

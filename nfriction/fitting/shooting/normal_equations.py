@@ -131,7 +131,6 @@ def marginalize_states(
 
     Args:
         rows: of the Jacobian, in order of time.
-        kept: the remaining variables.
         precision: of the states' prior, (window, state).
 
     Returns:

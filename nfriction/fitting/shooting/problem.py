@@ -46,7 +46,6 @@ class ShootingProblem:
     Args:
         jacobian: derivatives of a step; has the plant and its adjustable terms.
         friction: the friction model at the start, which a search leaves unchanged.
-        windows: of measured motion.
         noise_sd: standard deviation of a position error [rad; m], scale of the priors.
         measurement: matrix (joint, joint) from joint to recorded coordinates, where errors count.
         substeps: integration steps per sample.
@@ -54,8 +53,6 @@ class ShootingProblem:
             last far longer than a sample and sums over many parameters dominate the time of a step.
         friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
-        loss: of the errors.
-        options: priors of the initial states.
     """
 
     jacobian: StepJacobian

@@ -42,7 +42,6 @@ class StepJacobian:
     Args:
         plant: the mechanism as given.
         friction: the friction model; only its law matters here.
-        terms: adjustable terms of the plant.
 
     Attributes:
         after_step: derivatives (sample, row, direction) of the state (q, qd, that of a law with

@@ -88,12 +88,9 @@ class DecisionVariables:
 
     Args:
         schedule: its parameters are the start, and the values of parameters that are not fitted.
-        terms: adjustable terms of the plant.
-        windows: of measured motion.
         friction_prior, plant_prior: mean and standard deviation; default those of schedule and
             terms.
         offset_sd: of the encoder offsets, (recording, joint) [rad; m]; None for no offsets.
-        options: priors of the initial states.
     """
 
     schedule: Schedule

@@ -62,7 +62,6 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
     """Read the table in a file; the ending selects the format.
 
     Args:
-        path: of the file.
         sources: wanted columns, optionally with a unit after a colon; from formats with much other
             content only these and columns with our names are read.
     Raises:

@@ -39,8 +39,6 @@ class Adaptive(Tabulated):
     the envelope and the class.
 
     Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
         initial: start values in SI, (joint, class, coefficient), or one set for all classes,
             (joint, coefficient) or (coefficient,).
         hysteresis: a class is entered at `threshold * (1 + hysteresis)` on the way up and left at

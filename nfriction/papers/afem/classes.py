@@ -103,8 +103,6 @@ def find_classes(
         schedule: changed in place: its thresholds, swing rate and sample time are set.
         recordings: in joint coordinates.
         motions: smoothed motion of each recording.
-        joints: names of the joints.
-        options: given classes, or how to find them.
 
     Raises:
         ValueError: if no joint's acceleration varies enough to have classes, sample times differ,

@@ -77,7 +77,6 @@ def fit_adaptive(
     Args:
         model: the model to fit; changed in place.
         plant: the mechanism as given.
-        recordings: one or several.
         options: see `nfriction.fit`; the last window length is used for the classes.
         classes: how classes are found, and how far they may deviate from the constant law.
         start, motions, callback: see `nfriction.fit`.
@@ -249,7 +248,6 @@ class PositionError:
         plant, friction: the mechanism and its friction, whose schedule is overwritten and restored.
         windows: measured positions, with the states from which simulations start.
         measurement: matrix (joint, joint) from joint coordinates to those of the recording.
-        substeps: integration steps per sample.
         drive: class of every sample (window, step, joint), instead of that of the simulation.
         memory: hidden state at the start of each window, (window, joint, state_size).
         threads: number of threads among which candidates are divided.

@@ -88,7 +88,6 @@ class SearchOptions:
         tolerance: change relative to the scales (pattern) or the cost (SQP) that ends the search.
         seed: for the rotations of the pattern.
         threads: number of threads for the candidates; all processors by default.
-        state: state of an earlier search to resume.
 
     Raises:
         ValueError: if there is no such method, or the tolerance is not positive.
@@ -185,8 +184,6 @@ def search(
 
     Args:
         cost: values (m,) of candidates (m, parameter); values that are not finite are rejected.
-        box: start, bounds and scales.
-        options: method, limits and the state to resume.
         callback: called after every iteration; stops the search by returning True.
         residuals: of candidates (m, parameter), in parts (m, n) whose squares add up to twice the
             cost; a pattern search then also tries steps from the quadratic model of these.
@@ -413,7 +410,6 @@ def fit_by_search(
     Args:
         model: a model with constant or adaptive coefficients; changed in place.
         plant: the mechanism as given, or as fitted by `start` if that is given.
-        recordings: one or several.
         options: method, windows and limits.
         classes: of an adaptive model, see `fit_adaptive`.
         start: fit to start from; for an adaptive model, that of the constant law. By default the

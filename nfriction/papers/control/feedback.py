@@ -49,7 +49,6 @@ def linearise(
     """The frictionless plant near a motion, exactly discretised with zero-order hold of the torque.
 
     Args:
-        plant: the mechanism.
         q, qd, tau: of the motion [rad, rad/s, N m], (*batch, joint).
         sample_time: [s].
     """
@@ -92,7 +91,6 @@ class Gains:
     """Gains of feedback and of the Kalman filter at one sample.
 
     Attributes:
-        linear: the linear plant at this sample.
         feedback: K of dtau_1 = -K x, (2 joint,).
         observer: L of x += L (q_measured - q_predicted), (2 joint, joint).
         torque: of the first joint without feedback [N m].
@@ -132,7 +130,6 @@ def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weig
         way: the plant along the motion, (sample, ...).
         torque: of the first joint along it [N m], (sample,).
         top: the plant at its end.
-        weights: of regulator and Kalman filter.
 
     References:
         Riccati recursions, backward for the feedback, forward for the Kalman filter.

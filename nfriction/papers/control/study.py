@@ -216,7 +216,6 @@ def controlled(
     """Motions of the rig with its true friction, one per controller, simulated together.
 
     Args:
-        plant, friction: the rig and its true friction.
         controllers: by name; all with a swing-up of the same duration, or all without.
         seconds: duration of the upright motion.
     """
@@ -243,7 +242,6 @@ def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[
     """Performance of a balanced motion after it has settled.
 
     Args:
-        run: result of `controlled`.
         follow: whether its arm follows `reference`.
         settled: time from which it is evaluated [s].
 

@@ -57,11 +57,8 @@ def plan_swing_up(
     Args:
         plant: a chain on a free arm; only the arm has a drive.
         friction: assumed in the plan; None for none.
-        seconds: duration of the motion.
-        windows: number of shooting windows.
         torque_limit: of the plan [N m]; feedback needs the remaining torque of the drive.
         sample_time: time over which a torque is held [s].
-        max_steps: limit on steps of the solver.
 
     Raises:
         ValueError: if no such motion was found.

@@ -52,9 +52,6 @@ class EvolutionOptions:
 
     Attributes:
         prices: price of all rules in each run, as a fraction of the error of the given controller.
-        population: number of candidates.
-        generations: number per run.
-        seed: for all random numbers.
         checkpoint: file that stores every finished generation; a run that finds one with the same
             settings resumes from it. None for no checkpoint.
 
@@ -102,7 +99,6 @@ def evolve(
         law: whose torque is compared with the samples'.
         samples: to fit; test the result on others.
         v_smooth: of the law's smooth sign [rad/s].
-        options: prices of rules, effort, checkpoint.
         callback: called with price and generation after each generation.
 
     References:

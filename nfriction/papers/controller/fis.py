@@ -61,7 +61,6 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
     rule for each of its conditions, which gives the same output under max.
 
     Args:
-        text: of the file.
         units: of the inputs, which the format does not contain; "1" for dimensionless.
     Raises:
         ValueError: if the system is not supported; the message names the line.

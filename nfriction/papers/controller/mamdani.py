@@ -23,7 +23,6 @@ class MamdaniController(nn.Module):
     with gaps), an output is the middle of its universe.
 
     Args:
-        rules: variables, sets and rules.
         points: number of evenly spaced points of each output universe, including both ends.
         centroid: "trapezoid" (integral by the trapezoid rule) or "sum" (plain sum over the points,
             as in MATLAB).

@@ -68,7 +68,6 @@ def sampled(
     Args:
         controllers: of |velocity| and acceleration, one per joint.
         motion: velocity and acceleration as available to a controller, (sample, joint).
-        joint_names: one per joint.
         every: use one of this many samples.
 
     Raises:
@@ -97,7 +96,6 @@ def build_samples(
 
     Args:
         out: folder to which `<joint>.csv.gz` for every joint and `checksums.json` are written.
-        seed: for the encoders' errors.
         duration: of the experiment [s]; by default 40.
 
     Returns:

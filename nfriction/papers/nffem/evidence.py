@@ -62,7 +62,6 @@ class EvidenceState:
         alpha: prior precisions, shape (groups,).
         beta: noise precision.
         damping: mu of the next step.
-        step: number of accepted steps so far.
     """
 
     w: Tensor
@@ -80,12 +79,10 @@ class EvidenceOptions:
     """Settings of a run.
 
     Args:
-        max_steps: limit on accepted steps.
         tolerance: for convergence: relative error of alpha = gamma / 2E_g and of beta =
             (n - gamma) / 2E_D, and gain of a full Gauss-Newton step in nats.
         noise_floor: standard deviation of the errors at which fitting ends.
         callback: called with the state after each accepted step; stops the run by returning True.
-        progress: show a bar.
     Raises:
         ValueError: if the tolerance is not positive.
     """
@@ -115,7 +112,6 @@ class EvidenceResult:
         samples: n, number of errors in E_D.
         log_evidence: in nats, with all constants, so models of the same data can be compared.
         covariance: posterior covariance of the parameters, shape (p, p).
-        steps: accepted steps.
     """
 
     status: Status

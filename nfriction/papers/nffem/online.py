@@ -72,7 +72,6 @@ class OnlineNetwork:
 
     Args:
         model: with coefficients of `network="rbf"`; it is not changed.
-        options: settings of the learning.
 
     Attributes:
         weight: output layer and bias in units of `scale`, (joint, coefficient, unit + 1).

@@ -28,8 +28,6 @@ class RBFCoefficients(Schedule):
     leaves its own, but a network may. An untrained model is the constant law `initial`.
 
     Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
         initial: coefficients at the start in SI, (joint, coefficient) or (coefficient,).
         head_units: units of each joint's network; 10 in the papers.
         acceleration: `"along_motion"` uses qdd sgn(qd), `"signed"` qdd like the papers; likewise

@@ -52,7 +52,6 @@ class TrainingOptions(EvidenceOptions):
     Attributes:
         seed: for the samples of controllers, and for starts after the first: perturbed sets, or
             another k-means.
-        starts: number of starts.
         search_samples, search_steps: numbers of evenly thinned samples and of steps for comparing
             starts. Without regularisation these steps overfit if there are hardly more samples
             than parameters; `search_steps=0` then often ends at a larger evidence.
@@ -103,7 +102,6 @@ def controller_targets(
     Args:
         controller: of |velocity| and acceleration, as in the papers, or any other.
         samples: number of samples; 40,000 in the paper.
-        seed: of the random draw.
     Returns:
         x, shape (samples, inputs), in SI (rad/s, rad/s^2), and y, shape (samples, outputs).
     """
@@ -130,9 +128,7 @@ def train_on_controller(
 
     Args:
         network: from inputs in SI to outputs in SI, with one group per controller.
-        controllers: one per group.
         samples: see `controller_targets`; group g draws with seed + g.
-        options: see `train_network`.
 
     Returns:
         The result of each group in scaled units, inputs and outputs on [-1, 1]; fewer if an
@@ -171,7 +167,6 @@ def train_network(
         network: with initial sets (or units); the output layer needs no initial values.
         x: inputs, shape (samples, groups, inputs).
         y: targets, shape (samples, groups, outputs).
-        options: starts, steps and the callback.
 
     Returns:
         The result of each group in scaled units, inputs and outputs on [-1, 1]; fewer if an

@@ -44,8 +44,6 @@ def papers_neuro_fuzzy(
         adaptive: fitted, with coefficients for each class of acceleration.
         motions: of the recordings that it was fitted to, in joint coordinates.
         samples: largest number per joint, evenly thinned from the motions.
-        units: of the network.
-        options: of its training, see `train_network`.
 
     Returns:
         A model of the same law with the network as its schedule, without gradients, and the fit of
@@ -98,7 +96,6 @@ def train_on_samples(
         controllers: one per joint; the model stays within their universes.
         samples: along a measured motion.
         units: of each network; 10 in the paper.
-        options: of the training, see `train_network`.
         v_smooth: of the model's smooth sign [rad/s].
 
     Returns:

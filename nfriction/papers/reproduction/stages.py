@@ -104,8 +104,6 @@ def reproduce(
     Args:
         folder: where all files are written; created if missing.
         settings: effort. Results from different settings are replaced.
-        jobs: number of stages to run in parallel.
-        progress: show a progress bar of stages.
 
     Returns:
         The workspace, with every stage finished.
@@ -242,11 +240,9 @@ def fit_searched(
     """A model fitted by a search on the simulated position, resumed after an interruption.
 
     Args:
-        workspace, bench: the run and its rig.
         name: of the stage: a model name with a prefix or suffix.
         method, threads: see `SearchOptions`.
         horizon: length of the simulated windows [s].
-        start: fit to start from.
     """
     settings = workspace.settings
     model = model_by_name(name.removeprefix("rtip-").removesuffix("-pattern"))(bench.plant.joints)

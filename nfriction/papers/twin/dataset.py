@@ -64,8 +64,6 @@ class Specification:
     """A rig, its hidden friction and its recordings.
 
     Attributes:
-        rig: creates the plant.
-        friction: the true friction.
         duration: of each recording [s].
         releases: in the order in which they are recorded.
     """
@@ -185,8 +183,6 @@ class Twin:
     """Recordings of a simulated rig, and the truth behind them.
 
     Attributes:
-        name: of the twin.
-        plant: the rig without friction.
         recordings: by label, in the rig's own convention.
         splits: by label: for fitting ("train") or for testing ("test").
         initial_states: by label: exact q0 and qd0 at the release, in the rig's own convention.
@@ -215,7 +211,6 @@ def make(
         seed: for the encoders' errors and the clock's jitter; the motion itself is deterministic.
         duration: of each recording [s]; by default that of the experiment. A shorter twin is the
             beginning of a longer one.
-        progress: show a progress bar.
 
     Raises:
         ValueError: for an unknown name or a duration of fewer than 8 samples.

@@ -132,7 +132,6 @@ def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: boo
         truth: one of `TRUTHS`, or several joined by +, or "plain".
         seed: for releases, parameters, encoders and jitter.
         duration: of each recording [s].
-        progress: show a progress bar.
 
     Raises:
         ValueError: for an unknown truth, or a duration of fewer than 8 samples.

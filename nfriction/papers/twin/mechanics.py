@@ -246,12 +246,10 @@ def simulate(
     """The motion from a release, by classical Runge-Kutta steps finer than the sampling.
 
     Args:
-        links: the mechanism.
         friction: None for none.
         q0, qd0: joint angles and velocities at the release [rad, rad/s].
         samples: number of samples; the first is at the release.
         rate: samples per second [1/s].
-        substeps: integration steps per sample.
         advance: called after every simulated second.
     """
     rates = rates_of(links, friction)
