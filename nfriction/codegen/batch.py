@@ -132,13 +132,12 @@ class Driver:
     """Text of an entry point that processes rows `first` to `last`, several at a time if possible.
 
     Functions of the graph read and write arrays in the caller's workspace; every element has one
-    slot for each of the rows that are computed together.
+    slot for each of the rows that are computed together. `sizes` are elements of each array,
+    `places` array and index of the input nodes.
 
     Args:
         width: number of rows computed together as vectors, which share all parameters; 0 for one.
-        sizes: elements of each array in the workspace.
         once: nodes computed once, with one slot each.
-        places: array and index of the input nodes.
     """
 
     def __init__(
@@ -248,11 +247,7 @@ class Driver:
 
 
 class Kernel:
-    """Compiled code over the rows of a batch.
-
-    Args:
-        write: returns the driver for a number of rows computed together, 0 for one at a time.
-    """
+    """Compiled code over the rows of a batch; `write(width)` returns the driver, see there."""
 
     def __init__(self, write: Callable[[int], Driver], layout: Layout) -> None:
         self.layout = layout
@@ -268,14 +263,9 @@ class Kernel:
         settings: Mapping[str, int] | None = None,
         threads: int = 1,
     ) -> None:
-        """Fill the outputs.
+        """Fill contiguous outputs by name from series and parameters, (row, value) or a single row.
 
-        Args:
-            parameters: (row, value), or a single row for all.
-            given: series by name; the code must not read one that is omitted.
-            outputs: contiguous arrays to write to, by name.
-            settings: further integers.
-            threads: number of threads among which the rows are divided.
+        Rows are divided among threads; the code must not read a series that is omitted.
         """
         own = len(parameters) > 1
         numbers = {"p_row": parameters.shape[1] if own else 0, **(settings or {})}

@@ -67,13 +67,10 @@ class CompiledFunction:
         return batch.Kernel(lambda width: _driver(program, layout, width), layout), outputs
 
     def __call__(self, *inputs: Any) -> Any:
-        """Evaluate row by row.
+        """Evaluate row by row: an array (batch, *shape), or a tuple of them if there are several.
 
         Args:
             *inputs: arrays of shape (batch, *shape of the example); a single row applies to all.
-
-        Returns:
-            One array (batch, *shape), or a tuple of them if the function returns several.
 
         Raises:
             ValueError: if shapes do not fit.

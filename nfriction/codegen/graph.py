@@ -230,10 +230,9 @@ def _decomposed(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, A
 def trace(
     function: Callable[..., Any], inputs: Mapping[str, Tensor], parameters: Collection[str] = ()
 ) -> Program:
-    """Run `function(**inputs)` symbolically.
+    """Run `function(**inputs)` symbolically; it returns a tensor or a tuple of tensors.
 
     Args:
-        function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
         inputs: example tensors, float64; each becomes a separate input.
         parameters: names of the inputs that stay the same over many calls.
     """
@@ -269,10 +268,7 @@ class FunctionalModule:
     """A module whose floating-point parameters and buffers are inputs named p0, p1, ...
 
     Integer and boolean buffers remain constants: they index and select, so they must be known when
-    code is emitted.
-
-    Attributes:
-        shapes: of these parameters and buffers, by their names in the module.
+    code is emitted. `shapes` are those of the inputs, by their names in the module.
     """
 
     def __init__(self, module: nn.Module) -> None:
@@ -308,11 +304,7 @@ class FunctionalModule:
 
 
 class Method(nn.Module):
-    """A module, a bound method of one, or any callable, with named arguments.
-
-    Args:
-        function: the callable; its arguments are passed by position in the given order.
-    """
+    """A module, a bound method of one, or any callable, with named arguments passed by position."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__()

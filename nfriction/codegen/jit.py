@@ -33,8 +33,7 @@ LIBRARY = (
 def cache_folder() -> Path:
     """The private folder for compiled models; `NFRICTION_CACHE` overrides the platform's choice.
 
-    Raises:
-        PermissionError: if the folder belongs to another user or others may write to it.
+    Raises PermissionError if it belongs to another user or others may write to it.
     """
     given = os.environ.get("NFRICTION_CACHE")
     folder = Path(given) if given else _user_cache() / "nfriction"

@@ -94,12 +94,8 @@ def fit_models(
     """Fit every model to every part of the data, in levels of independent fits.
 
     Arguments and errors are those of `compare`; `parts` are data by the label of the work on them,
-    such as "fit". A model that cannot be fitted does not stop the others.
-
-    Returns:
-        Fits by part.
-    Raises:
-        FitsInterrupted: on a Ctrl-C.
+    such as "fit". A model that cannot be fitted does not stop the others; a Ctrl-C raises
+    FitsInterrupted. Returns fits by part.
     """
     check_jobs(jobs)
     if jobs != 1 and fit_settings.get("callback") is not None:
@@ -225,15 +221,14 @@ def as_completed(
 ) -> Iterator[tuple[str, T]]:
     """Run independent tasks and yield label and result of each when it is finished.
 
+    The first error of a task is raised, its message preceded by the label; tasks not finished by
+    then are abandoned.
+
     Args:
         work: a function; for more than one process it must be importable by its name.
         tasks: its arguments by the label of each task.
         jobs: number of processes; with 1, or a single task, the tasks run in this process.
         progress: receives the labels.
-
-    Raises:
-        ValueError, RuntimeError, ...: the first error of a task, its message preceded by the
-            label. Tasks not finished by then are abandoned.
     """
     progress = progress or Progress()
     level = _PACKAGE.getEffectiveLevel()

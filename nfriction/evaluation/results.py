@@ -72,9 +72,7 @@ def exclusive(folder: str | Path) -> Iterator[None]:
     """Keep other processes from writing a run into this folder, which is made if necessary.
 
     First cleans up after a killed process: complete files are put in place, others are removed.
-
-    Raises:
-        OSError: another process is writing it, or it cannot be written.
+    Raises OSError if another process is writing it, or it cannot be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -36,10 +36,9 @@ Session: TypeAlias = (
 class SessionFit(NamedTuple):
     """Estimates of one session.
 
-    Attributes:
-        values: of the coefficients and plant terms, by name.
-        sd: their standard deviations; infinite where the session does not determine them.
-        residual: root mean square position error of its windows [rad; m].
+    `values` and standard deviations of the coefficients and plant terms are by name, the latter
+    infinite where the session does not determine them; the `residual` is the root mean square
+    position error of its windows [rad; m].
     """
 
     values: dict[str, float]
@@ -181,14 +180,10 @@ def _fit_session(
 
 
 def random_effects(name: str, values: Array, sd: Array) -> Spread:
-    """Mean and spread of estimates with known errors.
+    """Mean and spread of estimates, one per session, with known errors; infinite ones do not count.
 
     The spread is the one at which the weighted squares of the deviations sum to their expectation,
     the number of estimates less one.
-
-    Args:
-        values: one estimate per session.
-        sd: its standard deviations; sessions with an infinite one do not count.
     """
     from scipy.optimize import brentq  # slow to import
     from scipy.stats import t as student

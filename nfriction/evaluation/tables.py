@@ -151,11 +151,9 @@ def coefficient_table(
 ) -> Table:
     """Coefficients by joint, and by range of validity if they follow the motion.
 
-    Joints are rows; many constants, as of a law with memory, are rows themselves.
-
-    Args:
-        sets: by range of validity (`"always"` for constants), then by name: one value per joint.
-        units: by name of the coefficient, as far as they are known.
+    Joints are rows; many constants, as of a law with memory, are rows themselves. `sets` are by
+    range of validity (`"always"` for constants), then by name; `units` by name, as far as they are
+    known.
     """
     names = list(next(iter(sets.values()), {}))
     follows = list(sets) != ["always"]
@@ -175,13 +173,7 @@ def coefficient_table(
 def interval_table(
     model: str, intervals: Sequence[tuple[str, float, float, float]], plant: bool
 ) -> Table:
-    """95 % confidence intervals.
-
-    Args:
-        model: its name.
-        intervals: parameter, value, lower and upper end.
-        plant: terms of the plant are among them.
-    """
+    """95 % confidence intervals of a model: parameter, value, ends; `plant` for its terms too."""
     caption = f"95 % confidence intervals of {model}"
     if plant:
         caption += " (plant terms as relative change from the rig, offsets in SI)"

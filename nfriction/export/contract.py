@@ -243,11 +243,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> "Contract":
-        """Read what `to_json` wrote.
-
-        Raises:
-            ContractError: if it is not of this form.
-        """
+        """Read what `to_json` wrote; raises ContractError if it is not of this form."""
         try:
             content = parse_json(text)
         except (ValueError, RecursionError) as error:
@@ -286,13 +282,9 @@ def contract_of(
     *,
     dtype: str = "float64",
 ) -> Contract:
-    """Make the contract of a controller, with its test vectors.
+    """Make the contract of a controller, with test vectors, for a target that computes in `dtype`.
 
-    Args:
-        dtype: "float64" or "float32", in which the target computes.
-
-    Raises:
-        ValueError: for another dtype, or if there is not one name per joint.
+    Raises ValueError if that is not "float64" or "float32", or there is not one name per joint.
     """
     if dtype not in TOLERANCE:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')

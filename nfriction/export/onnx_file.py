@@ -48,10 +48,9 @@ class Unknown(int):
 
 
 class OnnxGraph:
-    """Nodes, and constants by name, of a decomposed program with a dynamic first axis.
+    """Nodes, and constants by name, of a decomposed torch program with a dynamic first axis.
 
     Args:
-        program: of `torch.export`.
         inputs, outputs: names in the ONNX graph, in the program's order.
         real: type of its floating-point tensors, `np.float64` or `np.float32`.
     """

@@ -84,11 +84,8 @@ def fit_damping_frictionloss(
 ) -> DampingFit:
     """Fit damping and friction loss to a model by least squares over the samples of a motion.
 
-    Args:
-        motions: in joint coordinates; every sample has the same weight.
-        load: normal load at positions and velocities (sample, joint), such as `Plant.load`; 1 by
-            default.
-        info: names and unit of the joints.
+    Motions are in joint coordinates; every sample has the same weight. `load` is the normal load at
+    positions and velocities (sample, joint), such as `Plant.load`, 1 by default.
 
     Raises:
         ValueError: if the motion has other joints than the model, or none of it moves, or there is

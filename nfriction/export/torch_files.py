@@ -340,14 +340,9 @@ def contract_of_archive(path: str | Path) -> Contract:
 
 
 def own_program(path: str | Path, own: bytes) -> io.BytesIO:
-    """An archive with our own program and the numbers of an artefact.
+    """An archive with our own program, as torch writes it for the model, and an artefact's numbers.
 
-    Args:
-        path: of the artefact.
-        own: archive that torch writes for the expected model.
-
-    Raises:
-        ExportError: if it is not an archive, or has another program.
+    Raises ExportError if the artefact at `path` is not an archive, or has another program.
     """
     given, ours = _contents(path, path), _contents(path, io.BytesIO(own))
     if _computed(given) != _computed(ours):

@@ -44,7 +44,6 @@ def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]
     Args:
         law: with coefficients F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2, mu_d
             and mu_b.
-        joint: with time.
         blocks: rows that are held out in turn; shapes and forces are fitted to the others.
     """
     reach, fastest = range_of(joint), float(np.abs(joint.qd).max())

@@ -103,7 +103,6 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     """Fit the law `friction.hysteresis` to the rows of a joint in order of time.
 
     Args:
-        joint: with time.
         blocks: rows that are held out in turn; a term or a smaller ridge is used only if it lowers
             the error there by more than chance.
         loaded: friction is proportional to the load.

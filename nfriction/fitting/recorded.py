@@ -150,16 +150,11 @@ class Rules:
 def fit_recorded(
     schedule: Recorded, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
 ) -> MemoryFit:
-    """Fit the law and set the rules that improve hold-out blocks.
+    """Fit the law and set the rules that improve hold-out blocks, in a schedule of one joint.
 
-    Args:
-        schedule: of one joint; it gets the rules.
-        joint: rows in order of time.
-        blocks: rows that are held out in turn.
-        v_smooth: width of the smoothed direction [rad/s; m/s].
-
-    Returns:
-        Fit of the law, with the torque and the errors on the blocks that result with the rules.
+    Returns the fit of the law, with the torque and the errors on the blocks that result with the
+    rules. Rows are in order of time; `v_smooth` is the width of the smoothed direction [rad/s;
+    m/s].
     """
     found = fit_slip(joint, blocks, loaded=False)
     rules = Rules(schedule, joint, found, blocks, v_smooth)
@@ -191,12 +186,8 @@ def ripple_shift(
     """Shift of the positions at which a ripple explains a run better than by chance [rad; m].
 
     A different encoder zero puts the ripple out of phase; 0 if the run shows no such shift.
-
-    Args:
-        schedule: of one joint.
-        joint: rows with torque and position.
-        torque: that the model predicts at the rows, (row,).
-        blocks: rows of each block of the run.
+    `torque` is what the model predicts at the rows, (row,), and `blocks` are the rows of each
+    block.
     """
     inputs, still = recorded_inputs(joint), torch.zeros(len(joint), 1).double()
     shifts = float(schedule.period[0]) * np.arange(SHIFTS) / SHIFTS

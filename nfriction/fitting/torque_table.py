@@ -138,8 +138,7 @@ def fit_network(
 ) -> JointFit:
     """Train the network of a neuro-fuzzy model that `fit_joint` set to its constant law.
 
-    Args:
-        share: of the schedule's prior standard deviation.
+    `share` is that of the schedule's prior standard deviation.
     """
     model = copy.deepcopy(constant.model)
     qd, qdd, load, tau = _columns(joint)

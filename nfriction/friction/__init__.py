@@ -72,12 +72,7 @@ def add_law(law: "Law") -> str:
     """Make a law of one's own known by its name, also with `neuro-fuzzy:` before it.
 
     Commands, comparisons and model files then know its models as they know those of the library.
-
-    Returns:
-        The name of its constant model.
-
-    Raises:
-        ValueError: if the name is no identifier or that of another model.
+    Returns the name of its constant model; raises ValueError if the name is no identifier or taken.
     """
     name, plain = law.name, law.name.lower().replace("_", "-")
     made = {kind.letters + name: kind for kind in _KINDS if kind.prefix != _MISSING[0]}

@@ -71,11 +71,7 @@ class Heated(Schedule):
     def set_heat(
         self, capacity: Tensor | Sequence[float] | float, cooling_time: float, sample_time: float
     ) -> None:
-        """Set C [J] of each joint or of all, T [s] and the sample time [s].
-
-        Raises:
-            ValueError: if one of them is not positive and finite.
-        """
+        """Set C [J] of each joint or of all, T [s] and the sample time [s], all positive."""
         given = torch.as_tensor(capacity, dtype=torch.float64)
         if given.shape not in ((), (1,), (self.joints,)):
             raise ValueError(

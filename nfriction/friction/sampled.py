@@ -69,11 +69,7 @@ class _Torque(nn.Module):
 
 
 class _Sampled(Schedule):
-    """Coefficients, and the state of the law that has them.
-
-    Attributes:
-        loaded: whether the load moves that state.
-    """
+    """Coefficients, and the state of the law that has them, which the load moves if `loaded`."""
 
     # The law has no trained range, and a clamped velocity would move its state too little.
     handles_range = True

@@ -31,11 +31,7 @@ def input_range(
     *,
     allow_equal: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Bounds of every input, broadcast to `like` (groups, inputs).
-
-    Raises:
-        ValueError: if bounds are not finite or do not ascend.
-    """
+    """Bounds of every input, finite and ascending, broadcast to `like` (groups, inputs)."""
     low, high = (
         torch.as_tensor(end, dtype=like.dtype, device=like.device).expand_as(like)
         for end in (lower, upper)

@@ -109,12 +109,7 @@ class OrderedPartition(nn.Module):
 
     @torch.no_grad()
     def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Adopt the nearest ordered partition, with a margin of 2 % from the bounds.
-
-        Args:
-            centres, widths: shape (groups, sets).
-            lower, upper: range of each input, shape (groups, inputs).
-        """
+        """Adopt the nearest ordered partition, with a margin of 2 % from the inputs' bounds."""
         self.lower.copy_(lower)
         self.upper.copy_(upper)
         start = 0

@@ -39,10 +39,9 @@ class InvalidFile(ValueError):  # noqa: N818 - it names the finding
 
 
 def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds: float) -> None:
-    """Run a module's `main` in a worker process and wait for it.
+    """Run a module's `main`, which calls `worker_main`, in a worker process and wait for it.
 
     Args:
-        module: full name; its `main()` calls `worker_main`.
         task: plain JSON.
         folder: empty; for the results and the worker's temporary files.
         seconds: processor time limit [s], imports included.

@@ -32,9 +32,7 @@ def solve_free(
 def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve a positive semidefinite system; the minimum-norm solution if it is singular.
 
-    Args:
-        matrix: (p, p).
-        right: right sides, (p,) or (p, k); the solutions have its shape.
+    Right sides are (p,) or (p, k); the solutions have their shape.
     """
     sides = right if right.ndim == 2 else right[:, None]
     # Half the work of an LU factorisation, and no exception if it fails.
@@ -51,15 +49,10 @@ def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def solve_arrowhead(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
-    """Solve a system that is block diagonal from some row onward, by its Schur complement.
+    """Solve a symmetric system that is block diagonal from row `first` on, by its Schur complement.
 
-    The cost grows linearly with the number of blocks instead of with its cube.
-
-    Args:
-        matrix: symmetric, (p, p).
-        right: right sides, (p,) or (p, k).
-        first: row from which the matrix is block diagonal.
-        size: of each block.
+    The cost grows linearly with the number of blocks instead of with its cube. `right` is (p,) or
+    (p, k), `size` that of each block.
     """
     count = (len(matrix) - first) // size
     sides = right if right.ndim == 2 else right[:, None]
@@ -95,11 +88,7 @@ Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 def as_bounds(
     x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Both bounds in the shape of `x0`; infinite where there is none.
-
-    Raises:
-        ValueError: if a shape does not fit, or a lower bound exceeds the upper one.
-    """
+    """Both bounds in the shape of `x0`, in ascending order; infinite where there is none."""
     low = torch.as_tensor(-math.inf if lower is None else lower, dtype=x0.dtype, device=x0.device)
     high = torch.as_tensor(math.inf if upper is None else upper, dtype=x0.dtype, device=x0.device)
     for name, bound in (("lower", low), ("upper", high)):

@@ -313,7 +313,7 @@ def save_all(
     run: str = "",
     formats: Sequence[str] = (),
 ) -> list[Path]:
-    """Write every figure of a comparison as PNG.
+    """Write every figure of a comparison as PNG; returns the files written.
 
     `mechanism`, `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
     given recording, `torque_over_velocity`, `over_time_*` for each law with a model that follows
@@ -321,17 +321,11 @@ def save_all(
     rejected network has constant coefficients and none of these.
 
     Args:
-        recordings: those compared, or some of them.
+        recordings: those compared, or some of them; others raise ValueError.
         folder: made if it does not exist; files of the same name are replaced.
         run: id of the run, written into each PNG file.
         formats: additional ones: `"svg"` or `"pdf"` for papers, `"gif"` for animations of the test
             recordings, `motion_1.gif` and so on.
-
-    Returns:
-        The files written.
-
-    Raises:
-        ValueError: if a recording was not compared.
     """
     scored = {
         s.recording for p in comparison.parts for s in next(iter(comparison.scores(p).values()))

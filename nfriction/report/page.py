@@ -234,12 +234,7 @@ def document(template: str, title: str, **values: Any) -> str:
 
 
 def write_report(folder: str | Path, path: str | Path) -> Run:
-    """Write the page of a comparison's folder to a file; returns the run.
-
-    Raises:
-        RunError: if the folder is not one that a comparison wrote; see `read_run`.
-        OSError: if it cannot be read or the file cannot be written.
-    """
+    """Write the page of a comparison's folder to a file; returns the run, as `read_run` does."""
     run = read_run(folder)
     # A recording's name may come from a file name that is not valid UTF-8.
     write_atomically(path, to_html(run).encode(errors="backslashreplace"))

@@ -58,9 +58,8 @@ def write_torque_fits(
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models, a figure and `report.html` into a folder.
 
-    Args:
-        folder: made if it does not exist; files of these names are replaced.
-        command: command line that reproduces the results.
+    The folder is made if necessary, and files of these names are replaced; `command` is the command
+    line that reproduces the results.
     """
     folder = Path(folder)
     written, drawn = [], []

@@ -83,11 +83,9 @@ class Electronics:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlledMotion(protocols.Rollout):
-    """A motion under a controller.
+    """A motion under a controller, with torques over each step [N m], (*batch, steps, joint).
 
-    Attributes:
-        tau: torque over each step [N m], (*batch, steps, joint).
-        measured: encoder positions from which it was computed [rad], same shape.
+    `measured` are the encoder positions from which they were computed [rad], in the same shape.
     """
 
     tau: Tensor

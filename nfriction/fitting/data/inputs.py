@@ -50,12 +50,7 @@ RELEASED = 0.01, 0.04
 
 
 def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
-    """The given model, or a new one by its name.
-
-    Raises:
-        TypeError: for anything else.
-        ValueError: if no model has that name.
-    """
+    """The given model, or a new one by its name; TypeError or ValueError for anything else."""
     if isinstance(model, str):
         return model_by_name(model)(joints)
     if not isinstance(model, FrictionModel):
@@ -67,11 +62,7 @@ def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
 
 
 def require_doubles(model: torch.nn.Module, plant: torch.nn.Module) -> None:
-    """Refuse a model or plant in single precision, whose rounding ends searches early, or on a GPU.
-
-    Raises:
-        ValueError: if a parameter or buffer is not float64 on the CPU.
-    """
+    """Refuse models and plants in single precision, which ends searches early, or on a GPU."""
     for name, of in (("model", model), ("plant", plant)):
         for x in chain(of.parameters(), of.buffers()):
             if x.device.type != "cpu" or (x.is_floating_point() and x.dtype != torch.float64):
@@ -133,14 +124,7 @@ def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Ar
 def as_recording_list(
     recordings: RecordingLike | Iterable[RecordingLike], plant: Plant
 ) -> list[Recording]:
-    """The recordings of a fit as a list.
-
-    Raises:
-        TypeError: if one is not accepted by `Recording.of`.
-        ValueError: if a recording is given twice.
-    Warns:
-        UserWarning: if only some recordings have torques.
-    """
+    """The recordings of a fit as a list; raises if one is no recording or given twice."""
     given = Recording.many(recordings, plant=plant)
     _refuse_repeated(given)
     warn_of_undriven(given)
@@ -341,10 +325,7 @@ def apply_encoder_offsets(
 ) -> tuple[list[Recording], tuple[Motion, ...]]:
     """Recordings and motions as if their encoders had no offsets.
 
-    Args:
-        offsets: `FitResult.encoder_offsets`, one row per recording; empty for no change.
-        recordings: all in one convention.
-        motions: of the recordings, in joint coordinates.
+    `offsets` has one row per recording, empty for no change; motions are in joint coordinates.
     """
     if not offsets:
         return list(recordings), tuple(motions)

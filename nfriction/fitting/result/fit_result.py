@@ -37,12 +37,7 @@ UNIFORM_TURN = math.pi / 3**0.5
 
 @dataclass(frozen=True)
 class InputGain:
-    """Share of the squared error that an input explains.
-
-    Attributes:
-        share: with all joints.
-        by_joint: with each joint's coefficient alone, (joint,).
-    """
+    """Share of the squared error that an input explains, with all joints and with each alone."""
 
     name: str
     share: float

@@ -129,13 +129,9 @@ def marginalize_states(
 ) -> tuple[Tensor, Tensor]:
     """Marginalise the windows' states by a square-root information filter.
 
-    Args:
-        rows: of the Jacobian, in order of time.
-        precision: of the states' prior, (window, state).
-
-    Returns:
-        Curvature above round-off in the remaining variables, (kept, kept), and the derivatives of
-        each window's state with respect to its columns of these, (window, state, column).
+    Returns the curvature above round-off in the remaining variables, (kept, kept), and derivatives
+    of each window's state with respect to its columns of these, (window, state, column). Rows of
+    the Jacobian are in order of time; `precision` is that of the states' prior, (window, state).
     """
     windows, state = precision.shape
     columns = kept.shared + kept.indices.shape[1] - state

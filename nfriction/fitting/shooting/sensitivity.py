@@ -144,17 +144,9 @@ def propagate(
 ) -> Iterator[tuple[slice, Tensor]]:
     """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
-    Args:
-        jacobian: derivatives of one step.
-        run: the windows' motion.
-        substeps: steps per sample.
-        stride: samples per counted one.
-        states: derivatives with respect to the initial states only.
-
-    Yields:
-        Samples, and (window, sample, joint, column) with respect to friction parameters, plant
-        terms and the window's initial state. The last piece is the windows' last sample, counted or
-        not.
+    Yields samples, and (window, sample, joint, column) with respect to friction parameters, plant
+    terms and the window's initial state, or to that alone if `states`. The last piece is the
+    windows' last sample, counted or not.
     """
     windows, steps = run.step.shape
     joints, state = run.motion.q.shape[-1], run.state

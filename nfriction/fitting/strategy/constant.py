@@ -173,13 +173,9 @@ def warm_start_from_nested(
     motions: tuple[Motion, ...],
     equation_error: EquationError,
 ) -> Continuation:
-    """The better search of a law: its own, or the one from its nested law unless that `loses`.
+    """The better search of a law: its `own`, or the one from its nested law unless that `loses`.
 
-    Args:
-        own: search of the law itself.
-        fitter, nested: fitters of the law and of the nested law.
-        start: parameters of the nested law, and of the plant.
-        motions, equation_error: see `horizon_continuation`.
+    `start` are parameters of the nested law, and of the plant; for the rest `horizon_continuation`.
     """
     base = horizon_continuation(nested, *start, motions, of=f", {nested.friction.law.name} law")
     best = best_of_starts(fitter, own.end, base.end, equation_error)

@@ -23,11 +23,7 @@ class StoppedError(Exception):
 def cut_for_folds(
     joint: Sequence[Recording], motions: Sequence[Motion], length: float, folds: int
 ) -> Windows:
-    """At least `folds` windows, so that some can be held out; shorter ones for short recordings.
-
-    Raises:
-        ValueError: if the recordings have too few samples.
-    """
+    """At least `folds` windows, so that some can be held out; shorter ones for short recordings."""
     cut = cut_windows(joint, motions, length)
     if len(cut) >= folds:
         return cut

@@ -160,10 +160,7 @@ def heated_schedule(
 ) -> HeatedConstant:
     """Constant coefficients of a law with heat, scaled to peak at 1 if friction stays cold.
 
-    Args:
-        law, initial: see `Constant`; `initial` has no decrease with heat.
-        motions: in joint coordinates.
-        cooling_time: [s].
+    `initial` has no decrease with heat; the `cooling_time` is in seconds.
     """
     schedule = HeatedConstant(law, len(initial), initial)
     step = float(np.median(np.concatenate([np.diff(motion.time) for motion in motions])))
@@ -291,14 +288,8 @@ def chosen_inputs(
 ) -> tuple[tuple[InputGain, ...], FitResult, FitTask]:
     """Inputs favoured by the evidence, the constant fit with them, and the task with their plant.
 
-    Forward selection: each raises the evidence of the fit with the previous ones most.
-
-    Args:
-        task: with encoder offsets removed from recordings and motions.
-        start: constant fit of the law.
-
-    Raises:
-        StoppedError: if the caller stops a search.
+    Forward selection: each raises the evidence of the fit with the previous ones most. The task is
+    one without encoder offsets. Raises StoppedError if the caller stops a search.
     """
     names, at, longest = candidates(task), start, longest_duration(task.motions)
     # Load and position exclude each other, as a plant gives only one of them.

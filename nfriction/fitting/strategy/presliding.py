@@ -108,11 +108,7 @@ def ambiguous_stiffness(
     stiffness. A search from much stiffer bristles finds another one; if it differs by more than a
     factor of two and the likelihood does not favour the first, the value is not identifiable. The
     same holds if a search ended early and the other explains the motion to encoder resolution.
-
-    Args:
-        fitter: of the law.
-        found: end of its search.
-        stage: a stage with short windows, whose states hardly trap a search.
+    `stage` has short windows, whose states hardly trap a search.
     """
     from scipy.special import chdtri  # slow to import
 

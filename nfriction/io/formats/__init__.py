@@ -86,12 +86,7 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
 
 
 def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
-    """Write a table atomically; the ending selects the format. Missing folders are made.
-
-    Raises:
-        ValueError: an unknown ending.
-        OSError: the file cannot be written.
-    """
+    """Write a table atomically; the ending selects the format. Missing folders are made."""
     path = Path(path)
     writer = resolve_name(f"{__name__}.{_WRITERS[_ending(path, _WRITERS, 'written')]}")
     write_atomically(path, writer(table))

@@ -30,11 +30,8 @@ _FOUR_DIGITS = re.compile(r"[+-]?\d{4}", re.ASCII)
 def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[str, list[str]]:
     """The decimal sign of a table of text cells, and the columns that are ambiguous.
 
-    Args:
-        table: cells of one file, with one decimal sign throughout.
-        stated: the sign that the file states, if it does.
-        usual: guess if all columns can be read both ways and move equally smoothly; without commas,
-            the point.
+    `stated` is the sign that the file states, if it does; `usual` the guess if all columns can be
+    read both ways and move equally smoothly. Without commas it is the point.
     """
     if stated is not None and stated not in THOUSANDS:
         raise ValueError(
@@ -73,11 +70,7 @@ def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[s
 
 
 def column_numbers(table: pd.DataFrame, column: str) -> Array:
-    """A column as float64; empty cells are NaN.
-
-    Raises:
-        ValueError: a cell is not a number; the message names it.
-    """
+    """A column as float64; empty cells are NaN. A ValueError names a cell that is not a number."""
     cells = table[column].to_numpy(dtype=object, na_value=np.nan)
     # A table that was not read here states none: its text is read as Python does.
     decimal = str(table.attrs.get("decimal"))

@@ -147,10 +147,8 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
 class GivenClasses(Adaptive):
     """A table by class whose input is the class instead of the acceleration.
 
-    Args:
-        model: the model whose law and joints are used.
-        reference: constant coefficients toward which every class is pulled, (joint, coefficient).
-        sd: standard deviation around them, (joint, coefficient).
+    `reference` are the constant coefficients toward which every class is pulled, and `sd` the
+    standard deviation around them, both (joint, coefficient).
     """
 
     state_size = 0
@@ -176,11 +174,7 @@ class GivenClasses(Adaptive):
 
 @dataclass(frozen=True, eq=False)
 class GivenClassesProblem(ShootingProblem):
-    """A shooting problem whose coefficients follow given classes.
-
-    Args:
-        classes: of every sample of each recording, (sample, joint).
-    """
+    """A shooting problem whose coefficients follow given classes, (sample, joint) by recording."""
 
     classes: tuple[Tensor, ...] = ()
 

@@ -46,12 +46,7 @@ class LinearPlant:
 def linearise(
     plant: PendulumChain, q: Tensor, qd: Tensor, tau: Tensor, sample_time: float
 ) -> LinearPlant:
-    """The frictionless plant near a motion, exactly discretised with zero-order hold of the torque.
-
-    Args:
-        q, qd, tau: of the motion [rad, rad/s, N m], (*batch, joint).
-        sample_time: [s].
-    """
+    """The frictionless plant near a motion (*batch, joint), exactly discretised, torque held."""
     from scipy.linalg import expm  # slow to import
 
     n = plant.joints
@@ -103,10 +98,7 @@ class Gains:
 
 
 def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
-    """Steady-state gains at an equilibrium; only the first joint has a drive.
-
-    Raises:
-        ValueError: if the plant is not in equilibrium there.
+    """Steady-state gains at an equilibrium, else ValueError; only the first joint has a drive.
 
     References:
         Discrete algebraic Riccati equation (`scipy.linalg.solve_discrete_are`).

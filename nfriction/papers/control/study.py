@@ -215,9 +215,8 @@ def controlled(
 ) -> dict[str, ControlledMotion]:
     """Motions of the rig with its true friction, one per controller, simulated together.
 
-    Args:
-        controllers: by name; all with a swing-up of the same duration, or all without.
-        seconds: duration of the upright motion.
+    The controllers, by name, all have a swing-up of the same duration, or none. `seconds` is the
+    duration of the upright motion.
     """
     each = list(controllers.values())
 
@@ -239,16 +238,11 @@ def controlled(
 
 
 def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[str, float]:
-    """Performance of a balanced motion after it has settled.
+    """Performance of a balanced motion after the time `settled` [s].
 
-    Args:
-        follow: whether its arm follows `reference`.
-        settled: time from which it is evaluated [s].
-
-    Returns:
-        Tracking error of the arm and its largest excursion from the reference, largest angle of a
-        link from upright, mean power of the motor and root mean square of its torque; infinite
-        if the links fell.
+    Tracking error of the arm (if it has to `follow` the reference) and its largest excursion from
+    the reference, largest angle of a link from upright, mean power of the motor and root mean
+    square of its torque; infinite if the links fell.
     """
     late = run.time >= settled
     asked = np.array([reference(t)[0] if follow else 0.0 for t in run.time[late].tolist()])

@@ -125,12 +125,7 @@ def build_samples(
 def read_samples(
     folder: str | os.PathLike[str], joint_names: Sequence[str] = ("joint2", "joint3", "joint4")
 ) -> ControllerSamples:
-    """Samples from the folder to which `build_samples` wrote them.
-
-    Raises:
-        OSError: if a file is missing.
-        ValueError: if a file differs from its checksum.
-    """
+    """Samples from the folder to which `build_samples` wrote them; ValueError if changed since."""
     folder = Path(folder)
     tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
     outputs = tuple(tables[0].columns[1 + len(INPUTS) :])

@@ -85,11 +85,7 @@ def place_units(
 ) -> None:
     """Set a network to constant coefficients, with its units placed by k-means along motions.
 
-    Args:
-        schedule: changed in place.
-        values: coefficients, (joint, coefficient).
-        scale: size of each, (joint, coefficient), which determines its universe.
-        motions: in joint coordinates.
+    `scale` is the size of each coefficient (joint, coefficient), which determines its universe.
     """
     qd, qdd, state = [], [], []
     for motion in motions:

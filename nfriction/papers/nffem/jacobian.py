@@ -51,11 +51,7 @@ def flatten(parameters: Mapping[str, Tensor]) -> Tensor:
 
 
 def unflatten(vector: Tensor, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Inverse of `flatten`: views of `vector` with the names and shapes of `like`.
-
-    Raises:
-        ValueError: if the number of entries differs.
-    """
+    """Inverse of `flatten`: views of `vector` with the names and shapes of `like`."""
     sizes = [value.numel() for value in like.values()]
     if vector.shape != (sum(sizes),):
         raise ValueError(
@@ -111,15 +107,7 @@ def jacobian_pieces(
 
 
 def normal_equations(model: nn.Module, inputs: Tensor, targets: Tensor) -> NormalEquations:
-    """Normal equations of the least-squares problem model(inputs) = targets.
-
-    Args:
-        model: any module.
-        inputs: shape (n, ...).
-        targets: shape (n, *outputs).
-    Raises:
-        ValueError: if targets do not match.
-    """
+    """Normal equations of the least-squares problem model(inputs) = targets (n, *outputs)."""
     check_samples(inputs, targets)
     if isinstance(model, LinearOutputModule):
         return _from_columns(model, inputs, targets)

@@ -170,9 +170,7 @@ def project(layer: Anfis | RBFNetwork, x: Tensor, y: Tensor, steps: int) -> None
 class Projection:
     """Squared errors of a layer as a function of its sets alone; evaluations overwrite the layer.
 
-    Args:
-        layer, x, y: as in `project`.
-        ridge: precision of the output layer around zero, relative to that of the errors.
+    `ridge` is the precision of the output layer around zero, relative to that of the errors.
     """
 
     def __init__(

@@ -97,14 +97,7 @@ def recorded_losses(
 def controller_targets(
     controller: MamdaniController, samples: int = 40_000, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Inputs drawn evenly over a controller's universes, and its outputs.
-
-    Args:
-        controller: of |velocity| and acceleration, as in the papers, or any other.
-        samples: number of samples; 40,000 in the paper.
-    Returns:
-        x, shape (samples, inputs), in SI (rad/s, rad/s^2), and y, shape (samples, outputs).
-    """
+    """Inputs drawn evenly over a controller's universes, and its outputs, (samples, ...) in SI."""
     if samples < 1:
         raise ValueError(f"`samples` must be at least 1, got {samples}.")
     lower = controller.lower

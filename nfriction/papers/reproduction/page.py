@@ -212,11 +212,7 @@ def text(workspace: Workspace) -> str:
 
 
 def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
-    """Draw every figure of both papers as PNG in `figures/`.
-
-    Returns:
-        The files written.
-    """
+    """Draw every figure of both papers as PNG in `figures/`; returns the files written."""
     folder, written = workspace.folder / "figures", []
     drawings = {name: draw for item in ITEMS for name, draw in item.figures.items()}
     for name, draw in tqdm(drawings.items(), unit="figure", disable=not progress, leave=False):

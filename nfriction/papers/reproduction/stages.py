@@ -65,11 +65,9 @@ EXPERIMENT = "experiment"
 
 
 class Stage(NamedTuple):
-    """One step of a reproduction.
+    """One step of a reproduction, after those that it `needs`.
 
-    Attributes:
-        needs: stages that must be finished first.
-        run: runs it, given the workspace and the stage's name; returns its result as plain JSON.
+    `run` takes the workspace and the stage's name, and returns the result as plain JSON.
     """
 
     needs: tuple[str, ...]
@@ -239,10 +237,7 @@ def fit_searched(
 ) -> FitResult:
     """A model fitted by a search on the simulated position, resumed after an interruption.
 
-    Args:
-        name: of the stage: a model name with a prefix or suffix.
-        method, threads: see `SearchOptions`.
-        horizon: length of the simulated windows [s].
+    The stage's name is that of the model with a prefix or suffix; for the rest see `SearchOptions`.
     """
     settings = workspace.settings
     model = model_by_name(name.removeprefix("rtip-").removesuffix("-pattern"))(bench.plant.joints)

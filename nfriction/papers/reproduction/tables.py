@@ -110,11 +110,7 @@ def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
 
 @cache
 def agreement_table() -> pd.DataFrame:
-    """Agreement of independent simulations from the paper's check pose; see `agreement`.
-
-    References:
-        TLRIP paper, Figs. 3 and 4.
-    """
+    """Agreement of independent simulations from the TLRIP paper's check pose, Figs. 3 and 4."""
     # 20.56° is measured from hanging.
     start = np.deg2rad([200.56, 32.21, 45.0])
     return pd.concat({"ours": agreement(rigs.tlrip(), start, np.zeros(3))}, axis=1)
@@ -226,11 +222,7 @@ def second_table_4(workspace: Workspace) -> pd.DataFrame:
 
 
 def control_table(workspace: Workspace, task: str) -> pd.DataFrame:
-    """Performance of the balanced rig with the friction compensation of each model.
-
-    References:
-        TLRIP paper, future work: control with the friction models.
-    """
+    """Performance of the balanced rig with each model's compensation (TLRIP paper, future work)."""
     rows = workspace.found("control")["tables"][task]
     table = pd.DataFrame.from_dict(rows, orient="index", dtype=float).fillna(np.inf)
     return pd.concat({"ours": table}, axis=1)

@@ -61,12 +61,7 @@ class Release:
 
 @dataclass(frozen=True)
 class Specification:
-    """A rig, its hidden friction and its recordings.
-
-    Attributes:
-        duration: of each recording [s].
-        releases: in the order in which they are recorded.
-    """
+    """A rig, its hidden friction, and its recordings in order, each of this duration [s]."""
 
     rig: Callable[[], PendulumChain]
     friction: HiddenFriction
@@ -130,11 +125,7 @@ def names() -> list[str]:
 
 
 def specification(name: str) -> Specification:
-    """A twin's specification by its name.
-
-    Raises:
-        ValueError: for a name that is not in `names()`.
-    """
+    """A twin's specification by its name, which must be one of `names()`."""
     if name not in SPECIFICATIONS:
         raise ValueError(f"no twin {name!r}; there are {', '.join(SPECIFICATIONS)}.")
     return SPECIFICATIONS[name]

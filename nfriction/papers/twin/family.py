@@ -90,11 +90,7 @@ PLAIN = "plain"
 
 
 def effects_of(truth: str) -> tuple[str, ...]:
-    """The effects in a name such as "load+warming".
-
-    Raises:
-        ValueError: for an unknown or repeated one.
-    """
+    """The effects in a name such as "load+warming"; ValueError for unknown or repeated ones."""
     effects = () if truth == PLAIN else tuple(truth.split("+"))
     if not set(effects) <= set(TRUTHS) or len(set(effects)) < len(effects):
         raise ValueError(
