@@ -83,38 +83,23 @@ def longest_window(recording: Recording) -> float:
 
 @dataclass(frozen=True)
 class Starts:
-    """States at the first samples of lead-ins, with their uncertainty.
+    """States at the first samples of lead-ins, with their uncertainty."""
 
-    Attributes:
-        state: position and velocity in the recording's coordinates, (window, 2 joint).
-        root: of the states' covariance root @ root.T, (window, 2 joint, 2 joint).
-        noise: standard deviation of a measured position, (window, joint).
-        deviations: random errors of the states, (draw, window, 2 joint); the same every time.
-    """
-
-    state: Array
-    root: Array
-    noise: Array
-    deviations: Array
+    state: Array  # position and velocity in the recording's coordinates, (window, 2 joint)
+    root: Array  # of the states' covariance root @ root.T, (window, 2 joint, 2 joint)
+    noise: Array  # standard deviation of a measured position, (window, joint)
+    deviations: Array  # random errors of the states, (draw, window, 2 joint); the same every time
 
 
 @dataclass(frozen=True)
 class Runs:
-    """Simulations over windows of equal length, in the recording's coordinates.
+    """Simulations over windows of equal length, in the recording's coordinates."""
 
-    Attributes:
-        samples: of the recording, (window, sample).
-        q: positions, (window, sample, joint).
-        error: of those that are scored, (window, scored sample, joint).
-        squares: mean square error from each start that the lead-in allows, (draw, joint).
-        diverged_at: time of the first divergence [s].
-    """
-
-    samples: NDArray[np.intp]
-    q: Array
-    error: Array
-    squares: Array
-    diverged_at: float
+    samples: NDArray[np.intp]  # of the recording, (window, sample)
+    q: Array  # positions, (window, sample, joint)
+    error: Array  # of those that are scored, (window, scored sample, joint)
+    squares: Array  # mean square error from each start that the lead-in allows, (draw, joint)
+    diverged_at: float  # time of the first divergence [s]
 
 
 class Simulator:

@@ -35,17 +35,11 @@ MOST_SUCCESSIVE = 2000
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of the comparison of an artefact with its model.
+    """Result of the comparison of an artefact with its model."""
 
-    Attributes:
-        vectors: at its own test vectors, including edges and NaN.
-        points: at random points up to 10 % beyond the range, against the model itself.
-        differences: between its metadata and the model file, in words.
-    """
-
-    vectors: Parity
-    points: Parity
-    differences: tuple[str, ...]
+    vectors: Parity  # at its own test vectors, including edges and NaN
+    points: Parity  # at random points up to 10 % beyond the range, against the model itself
+    differences: tuple[str, ...]  # between its metadata and the model file, in words
 
     @property
     def passed(self) -> bool:

@@ -204,17 +204,11 @@ def ripple_shift(
 
 
 class _Ripple(NamedTuple):
-    """Power of errors over the frequency of a position.
+    """Power of errors over the frequency of a position."""
 
-    Attributes:
-        waves: radians of the ripple per unit of position, (frequency,).
-        sums: of error times speed times wave, (block, direction, frequency).
-        squares: sums of squares of the speed, (block, direction).
-    """
-
-    waves: Array
-    sums: NDArray[np.complex128]
-    squares: Array
+    waves: Array  # radians of the ripple per unit of position, (frequency,)
+    sums: NDArray[np.complex128]  # of error times speed times wave, (block, direction, frequency)
+    squares: Array  # sums of squares of the speed, (block, direction)
 
     @classmethod
     def of(

@@ -73,17 +73,11 @@ ROUNDOFF_UNITS = 30.0
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """The variables that remain: the shared ones, and the encoder offsets of all recordings.
+    """The variables that remain: the shared ones, and the encoder offsets of all recordings."""
 
-    Attributes:
-        indices: see `DecisionVariables.indices`.
-        state: number of variables of a window's state.
-        size: number of all variables.
-    """
-
-    indices: Tensor
-    state: int
-    size: int
+    indices: Tensor  # see `DecisionVariables.indices`
+    state: int  # number of variables of a window's state
+    size: int  # number of all variables
 
     @property
     def shared(self) -> int:

@@ -68,33 +68,21 @@ def linearise(
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of a linear-quadratic regulator and of its Kalman filter.
+    """Weights of a linear-quadratic regulator and of its Kalman filter."""
 
-    Attributes:
-        state: diagonal of Q in the cost sum x'Qx + tau_1^2, (2 joint,).
-        torque_noise: standard deviation per sample of unknown torques at every joint [N m].
-        position_noise: standard deviation of the encoders [rad].
-    """
-
-    state: Array
-    torque_noise: float
-    position_noise: float
+    state: Array  # diagonal of Q in the cost sum x'Qx + tau_1^2, (2 joint,)
+    torque_noise: float  # standard deviation per sample of unknown torques at every joint [N m]
+    position_noise: float  # standard deviation of the encoders [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of feedback and of the Kalman filter at one sample.
-
-    Attributes:
-        feedback: K of dtau_1 = -K x, (2 joint,).
-        observer: L of x += L (q_measured - q_predicted), (2 joint, joint).
-        torque: of the first joint without feedback [N m].
-    """
+    """Gains of feedback and of the Kalman filter at one sample."""
 
     linear: LinearPlant
-    feedback: Array
-    observer: Array
-    torque: float = 0.0
+    feedback: Array  # K of dtau_1 = -K x, (2 joint,)
+    observer: Array  # L of x += L (q_measured - q_predicted), (2 joint, joint)
+    torque: float = 0.0  # of the first joint without feedback [N m]
 
 
 def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:

@@ -29,21 +29,13 @@ CHECKSUMS = "checksums.json"
 
 @dataclass(frozen=True, eq=False)
 class ControllerSamples:
-    """Inputs and outputs of a fuzzy controller for every joint.
+    """Inputs and outputs of a fuzzy controller for every joint."""
 
-    Attributes:
-        joint_names: in the order of the arrays.
-        output_names: names of the coefficients.
-        time: [s], shape (sample,).
-        x: |velocity| [rad/s] and acceleration [rad/s^2], shape (sample, joint, 2).
-        y: coefficients in SI, shape (sample, joint, output).
-    """
-
-    joint_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    time: NDArray[np.float64]
-    x: Tensor
-    y: Tensor
+    joint_names: tuple[str, ...]  # in the order of the arrays
+    output_names: tuple[str, ...]  # names of the coefficients
+    time: NDArray[np.float64]  # [s], shape (sample,)
+    x: Tensor  # |velocity| [rad/s] and acceleration [rad/s^2], shape (sample, joint, 2)
+    y: Tensor  # coefficients in SI, shape (sample, joint, output)
 
     def __len__(self) -> int:
         return len(self.time)

@@ -55,19 +55,12 @@ LARGEST_RATIO = 1e12
 
 @dataclass(frozen=True, eq=False)
 class EvidenceState:
-    """State of a run, as passed to a callback.
+    """State of a run, as passed to a callback."""
 
-    Args:
-        w: parameters, shape (p,).
-        alpha: prior precisions, shape (groups,).
-        beta: noise precision.
-        damping: mu of the next step.
-    """
-
-    w: Tensor
-    alpha: Tensor
-    beta: float = 1.0
-    damping: float = FIRST_DAMPING
+    w: Tensor  # parameters, shape (p,)
+    alpha: Tensor  # prior precisions, shape (groups,)
+    beta: float = 1.0  # noise precision
+    damping: float = FIRST_DAMPING  # mu of the next step
     step: int = 0
 
 
@@ -366,21 +359,13 @@ class _Fit:
 
 
 class Posterior(NamedTuple):
-    """Gauss-Laplace posterior at given parameters, alpha and beta.
+    """Gauss-Laplace posterior at given parameters, alpha and beta."""
 
-    Args:
-        covariance: of the parameters, (2 S)^-1, shape (p, p).
-        gamma: effective (well determined) parameters of each group, shape (groups,).
-        log_evidence: log p(data | alpha, beta) in nats, with all its constants.
-        newton_decrement: gain in log posterior of a full Gauss-Newton step, in nats.
-        parameter_squares: E_g, shape (groups,).
-    """
-
-    covariance: Tensor
-    gamma: Tensor
-    log_evidence: float
-    newton_decrement: float
-    parameter_squares: Tensor
+    covariance: Tensor  # of the parameters, (2 S)^-1, shape (p, p)
+    gamma: Tensor  # effective (well determined) parameters of each group, shape (groups,)
+    log_evidence: float  # log p(data | alpha, beta) in nats, with all its constants
+    newton_decrement: float  # gain in log posterior of a full Gauss-Newton step, in nats
+    parameter_squares: Tensor  # E_g, shape (groups,)
 
 
 def posterior(

@@ -38,19 +38,12 @@ RELEASE_ERROR = 0.1
 
 @dataclass(frozen=True)
 class Release:
-    """The start of one recording.
+    """The start of one recording."""
 
-    Attributes:
-        label: name of the recording and its file.
-        split: for fitting or for testing.
-        degrees: joint angles in the rig's own convention [deg].
-        qd: joint velocities [rad/s].
-    """
-
-    label: str
-    split: Split
-    degrees: Vector
-    qd: Vector = (0.0, 0.0, 0.0)
+    label: str  # name of the recording and its file
+    split: Split  # for fitting or for testing
+    degrees: Vector  # joint angles in the rig's own convention [deg]
+    qd: Vector = (0.0, 0.0, 0.0)  # joint velocities [rad/s]
 
     @property
     def q(self) -> Vector:

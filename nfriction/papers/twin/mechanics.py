@@ -79,33 +79,19 @@ class Links:
 
 @dataclass(frozen=True)
 class HiddenFriction:
-    """Parameters of the true friction, one value per joint where the joints differ.
+    """Parameters of the true friction, one value per joint where the joints differ."""
 
-    Attributes:
-        seal: F_c, dry drag of the seal [N m].
-        bearing_arm: r_mu, coefficient of friction times radius [m].
-        stribeck_rise: k, ratio of dry friction at standstill to that in motion, minus one [-].
-        stribeck_velocity: v_s [rad/s].
-        asymmetry: d, dry friction is (1 + d) times as much for positive velocities [-].
-        viscous: B of cold, unsheared grease [N m s/rad].
-        shear_velocity: v_t, above which the grease thins [rad/s].
-        shear_exponent: n, 1 for a Newtonian fluid [-].
-        warming: p, long-term relative loss of the grease's viscosity [-].
-        warming_time: T [s].
-        v_smooth: velocity over which the sign changes, for the integrator [rad/s].
-    """
-
-    seal: Vector
-    bearing_arm: Vector
-    stribeck_rise: Vector
-    stribeck_velocity: Vector
-    asymmetry: Vector
-    viscous: Vector
-    shear_velocity: Vector
-    shear_exponent: float = 0.7
-    warming: float = 0.175
-    warming_time: float = 20.0
-    v_smooth: float = 3e-3
+    seal: Vector  # F_c, dry drag of the seal [N m]
+    bearing_arm: Vector  # r_mu, coefficient of friction times radius [m]
+    stribeck_rise: Vector  # k, ratio of dry friction at standstill to that in motion, minus one [-]
+    stribeck_velocity: Vector  # v_s [rad/s]
+    asymmetry: Vector  # d, dry friction is (1 + d) times as much for positive velocities [-]
+    viscous: Vector  # B of cold, unsheared grease [N m s/rad]
+    shear_velocity: Vector  # v_t, above which the grease thins [rad/s]
+    shear_exponent: float = 0.7  # n, 1 for a Newtonian fluid [-]
+    warming: float = 0.175  # p, long-term relative loss of the grease's viscosity [-]
+    warming_time: float = 20.0  # T [s]
+    v_smooth: float = 3e-3  # velocity over which the sign changes, for the integrator [rad/s]
 
     def viscosity(self, time: float) -> float:
         """Viscosity of the grease relative to its initial value, w(t) [-]."""
