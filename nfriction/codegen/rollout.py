@@ -241,27 +241,19 @@ _CHECK_TOLERANCE = 1e-9
 class RolloutInputs:
     """Initial state and inputs of a rollout.
 
-    Attributes:
-        q0, qd0: initial state [rad, rad/s], (*batch, joint).
-        tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
-        step: sample times [s], (steps,) or (*batch, steps).
-        substeps: integration steps per sample.
-        measured: velocity and acceleration that drive the coefficients instead of the simulated
-            ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
-        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
-            None to compute it from the first sample.
-        law_state: internal state of the friction law at the start, (*batch, joint, state); None
-            for a law without memory.
+    The coefficients follow the velocity and acceleration in `measured`, each (*batch, steps, joint)
+    or without batch, or without them the simulated motion. Their `hidden_state` after the first
+    sample is computed from that sample if it is not given.
     """
 
-    q0: Tensor
-    qd0: Tensor
-    tau: Tensor
-    step: Tensor
-    substeps: int = 1
+    q0: Tensor  # [rad], (*batch, joint)
+    qd0: Tensor  # [rad/s], (*batch, joint)
+    tau: Tensor  # held over each step [N m], (steps, joint) or (*batch, steps, joint)
+    step: Tensor  # sample times [s], (steps,) or (*batch, steps)
+    substeps: int = 1  # integration steps per sample
     measured: tuple[Tensor, Tensor] | None = None
-    hidden_state: Tensor | None = None
-    law_state: Tensor | None = None
+    hidden_state: Tensor | None = None  # (*batch, joint, state_size)
+    law_state: Tensor | None = None  # of a law with memory, (*batch, joint, state)
 
 
 class CompiledRollout:

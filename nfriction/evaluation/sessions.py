@@ -50,23 +50,16 @@ class SessionFit(NamedTuple):
 
 @dataclass(frozen=True)
 class Spread:
-    """A parameter over all sessions.
-
-    Attributes:
-        between: standard deviation between sessions, beyond what their own errors explain.
-        low, high: 95 % confidence interval of the mean.
-        next_low, next_high: 95 % prediction interval of the next session's value.
-        sessions: number of sessions that determine it.
-    """
+    """A parameter over all sessions."""
 
     name: str
     mean: float
-    between: float
-    low: float
+    between: float  # standard deviation between sessions, beyond what their own errors explain
+    low: float  # ends of the 95 % confidence interval of the mean
     high: float
-    next_low: float
+    next_low: float  # ends of the 95 % prediction interval of the next session's value
     next_high: float
-    sessions: int
+    sessions: int  # number of sessions that determine it
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,22 +156,13 @@ Runner = Callable[..., Sequence[Any]]
 
 @dataclass(frozen=True)
 class Parity:
-    """Largest differences of an artefact from its model.
+    """Largest differences of an artefact from its model."""
 
-    Attributes:
-        points: samples compared.
-        torque_error: largest |difference| of the torque over the joint's full scale, which is the
-            largest |torque| or that of `Contract.scales`.
-        coefficient_error: the same for the coefficients, over the full scale of each.
-        edges: samples whose status or NaN differ from those of the model.
-        tolerance: largest torque error allowed; 20 times that for the coefficients.
-    """
-
-    points: int
-    torque_error: float
-    coefficient_error: float
-    edges: int
-    tolerance: float
+    points: int  # samples compared
+    torque_error: float  # largest |difference| over the joint's full scale, see `Contract.scales`
+    coefficient_error: float  # the same for the coefficients, over the full scale of each
+    edges: int  # samples whose status or NaN differ from those of the model
+    tolerance: float  # largest torque error allowed; 20 times that for the coefficients
 
     @property
     def passed(self) -> bool:

@@ -30,23 +30,17 @@ Load = Callable[[Tensor, Tensor], Tensor]
 class DampingFit:
     """Damping and friction loss closest to a model.
 
-    Attributes:
-        damping: [N m s/rad], (joint,).
-        frictionloss: [N m], (joint,).
-        rms_torque: of the model along the motion [N m], (joint,).
-        rms_error: of the torque with these two numbers [N m], (joint,).
-        unit: of a joint's position, "rad" or "m".
-        lugre: stiffness, damping, Coulomb and static friction of bristles and Stribeck velocity,
-            in MuJoCo's order, (joint, 5); empty without LuGre friction.
+    `lugre`, empty without LuGre friction, contains stiffness, damping, Coulomb and static friction
+    of bristles and Stribeck velocity, in MuJoCo's order.
     """
 
     joint_names: tuple[str, ...]
-    damping: tuple[float, ...]
-    frictionloss: tuple[float, ...]
-    rms_torque: tuple[float, ...]
-    rms_error: tuple[float, ...]
-    unit: str = "rad"
-    lugre: tuple[tuple[float, ...], ...] = ()
+    damping: tuple[float, ...]  # [N m s/rad], (joint,)
+    frictionloss: tuple[float, ...]  # [N m], (joint,)
+    rms_torque: tuple[float, ...]  # of the model along the motion [N m], (joint,)
+    rms_error: tuple[float, ...]  # of the torque with these two numbers [N m], (joint,)
+    unit: str = "rad"  # of a joint's position, "rad" or "m"
+    lugre: tuple[tuple[float, ...], ...] = ()  # (joint, 5)
 
     @property
     def relative_error(self) -> tuple[float, ...]:

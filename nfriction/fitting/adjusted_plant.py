@@ -18,23 +18,16 @@ TORQUE_DELAY = "torque delay [s]"
 class PlantParameter:
     """One adjustable term.
 
-    Attributes:
-        name: as in reports.
-        change: of the plant's buffers per unit, each in the shape of its buffer; for a ratio, 1 at
-            the entries that it scales. Empty for the delay of the torque.
-        lower, upper: bounds.
-        prior_sd: standard deviation of the prior around 0.
-        ratio: whether it scales its entries, rather than adding to them.
-        to_none: true if the lower bound means that the effect is absent.
+    The delay of the torque changes no buffer.
     """
 
-    name: str
-    change: Mapping[str, Tensor]
+    name: str  # as in reports
+    change: Mapping[str, Tensor]  # of the plant's buffers per unit, in their shapes
     lower: float
     upper: float
-    prior_sd: float
-    ratio: bool = False
-    to_none: bool = False
+    prior_sd: float  # standard deviation of the prior around 0
+    ratio: bool = False  # whether it scales the entries that are 1, rather than adding to them
+    to_none: bool = False  # true if the lower bound means that the effect is absent
 
 
 def delay_index(terms: Sequence[PlantParameter]) -> int | None:

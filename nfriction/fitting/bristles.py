@@ -80,16 +80,13 @@ def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]
 class _Bundle:
     """Shapes of a bristle, and the products of their unit torques by block.
 
-    Attributes:
-        shaping, shapes: names, and values (shape, name) for a Coulomb friction of 1.
-        places: indices of the linear coefficients, the Coulomb friction first.
-        parts: for each block, products of the unit torques with each other (block, shape, column,
-            column), with the torque (block, shape, column), and of the torque (block,).
+    `parts` are, for each block, products of the unit torques with each other (block, shape, column,
+    column), with the torque (block, shape, column), and of the torque (block,).
     """
 
-    shaping: list[str]
-    shapes: Array
-    places: tuple[int, ...]
+    shaping: list[str]  # names
+    shapes: Array  # (shape, name), for a Coulomb friction of 1
+    places: tuple[int, ...]  # indices of the linear coefficients, the Coulomb friction first
     parts: tuple[Array, Array, Array]
 
     @classmethod

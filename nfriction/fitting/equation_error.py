@@ -101,27 +101,18 @@ class TorqueBalance:
     torques and the law's regressors pass the same filter, its bias cancels; otherwise a reversal
     smeared over 50 ms would hide all friction that falls with speed.
 
-    Attributes:
-        qd, load: (sample, joint).
-        torque: friction torque, (sample, joint) [N m].
-        kept: samples away from the ends whose direction of motion is known, (sample, joint).
-        rate: corner frequency of the smoother, (joint,) [rad/s]; None for a motion that was not
-            smoothed.
-        step: [s].
-        segments: first and last sample of each part without a gap.
-
     References:
         M. Gautier, Dynamic identification of robots with power model, ICRA 1997 (both sides of
         the regression through one low-pass filter).
     """
 
-    qd: Tensor
-    load: Tensor
-    torque: Tensor
-    kept: Tensor
-    rate: Tensor | None
-    step: float
-    segments: Sequence[tuple[int, int]]
+    qd: Tensor  # (sample, joint)
+    load: Tensor  # (sample, joint)
+    torque: Tensor  # of friction, (sample, joint) [N m]
+    kept: Tensor  # samples away from the ends whose direction of motion is known, (sample, joint)
+    rate: Tensor | None  # corner frequency of the smoother, (joint,) [rad/s]; None without one
+    step: float  # [s]
+    segments: Sequence[tuple[int, int]]  # first and last sample of each part without a gap
 
     def smoothed(self, x: Tensor) -> Tensor:
         """Torques (sample, joint, any) filtered as by the smoother."""

@@ -46,25 +46,15 @@ START_ROWS = 3000
 
 @dataclass(frozen=True)
 class MemoryFit:
-    """A law with memory that was fitted to a joint.
+    """A law with memory that was fitted to a joint."""
 
-    Attributes:
-        coefficients: of the law, (coefficient,).
-        errors: root mean square error on each block left out [N m; N].
-        torque: predicted at all rows, (row,).
-        design: torque per unit of each fitted coefficient, (row, fitted).
-        fitted: indices of these among the coefficients.
-        presliding: False if no stiffness explains the rows better than a stiff joint does.
-        without: torque predicted by the fit without each block, (block, row), if known.
-    """
-
-    coefficients: Array
-    errors: tuple[float, ...]
-    torque: Array
-    design: Array
-    fitted: tuple[int, ...]
-    presliding: bool = True
-    without: Array | None = None
+    coefficients: Array  # of the law, (coefficient,)
+    errors: tuple[float, ...]  # root mean square error on each block left out [N m; N]
+    torque: Array  # predicted at all rows, (row,)
+    design: Array  # torque per unit of each fitted coefficient, (row, fitted)
+    fitted: tuple[int, ...]  # indices of these among the coefficients
+    presliding: bool = True  # False if no stiffness explains the rows better than a stiff joint
+    without: Array | None = None  # torque predicted by the fit without each block, (block, row)
 
 
 def path_of(joint: JointTorque) -> Array:
@@ -201,24 +191,15 @@ class _Fold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """Columns of all terms: offset, viscous, excess of a rest, velocities, and elements.
+    """Columns of all terms: offset, viscous, excess of a rest, velocities, and elements."""
 
-    Attributes:
-        whole: (row, column).
-        tau: torque, (row,).
-        velocities: at which friction saturates or drops, (velocity,).
-        gram, right: products of the columns with each other, and with the torque.
-        lead: number of rows of the lead-in.
-        fading: path over which the excess of a rest fades [rad; m].
-    """
-
-    whole: Array
-    tau: Array
-    velocities: Array
-    gram: Array
-    right: Array
-    lead: int
-    fading: float
+    whole: Array  # (row, column)
+    tau: Array  # torque, (row,)
+    velocities: Array  # at which friction saturates or drops, (velocity,)
+    gram: Array  # products of the columns with each other
+    right: Array  # products of the columns with the torque
+    lead: int  # number of rows of the lead-in
+    fading: float  # path over which the excess of a rest fades [rad; m]
 
     @classmethod
     def of(cls, joint: JointTorque, z: Array, loaded: bool, fading: float) -> "_Dictionary":

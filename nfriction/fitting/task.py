@@ -26,34 +26,22 @@ Callback = Callable[[str, Step], bool | None]
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """Checked arguments of a fit, as every strategy (`Schedule.fit_strategy`) takes them.
+    """Checked arguments of a fit, as every strategy (`Schedule.fit_strategy`) takes them."""
 
-    Attributes:
-        model: the model to fit; a strategy changes it once, at the end.
-        plant: the mechanism as given.
-        recordings: in joint coordinates.
-        measurement: matrix from joint to recorded coordinates, see `measurement_matrix`.
-        motions: smoothed motion of each recording, in joint coordinates.
-        callback: `callback(stage, step)` after every step, a name and a `Step`; True stops.
-        per_recording: whether encoders were set to zero at the start of each recording.
-        delay: of the torque after the positions from the balance of torques [s]; 0 unless fitted.
-        drift, play: those of `data_warnings` on changes of friction and on play of gears.
-    """
-
-    model: FrictionModel
-    plant: Plant
-    recordings: Sequence[Recording]
-    measurement: Tensor
-    motions: tuple[Motion, ...]
+    model: FrictionModel  # to fit; a strategy changes it once, at the end
+    plant: Plant  # the mechanism as given
+    recordings: Sequence[Recording]  # in joint coordinates
+    measurement: Tensor  # matrix from joint to recorded coordinates, see `measurement_matrix`
+    motions: tuple[Motion, ...]  # smoothed motion of each recording, in joint coordinates
     options: FitOptions
     start: FitResult | None = None
-    callback: Callback | None = None
-    per_recording: bool = False
-    delay: float = 0.0
+    callback: Callback | None = None  # `callback(stage, step)` after every step; True stops
+    per_recording: bool = False  # whether encoders were set to zero at the start of each recording
+    delay: float = 0.0  # of the torque after the positions, by their balance [s]; 0 unless fitted
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
-    drift: tuple[str, ...] = ()
-    play: tuple[str, ...] = ()
+    drift: tuple[str, ...] = ()  # those of `data_warnings` on changes of friction
+    play: tuple[str, ...] = ()  # those on play of gears
 
 
 def prepare_task(

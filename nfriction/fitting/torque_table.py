@@ -40,21 +40,13 @@ START_SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """A friction model of one joint, fitted to its rows of a table.
+    """A friction model of one joint, fitted to its rows of a table."""
 
-    Attributes:
-        model: of one joint, without gradients.
-        intervals: 95 % confidence intervals of constant coefficients.
-        unidentifiable: coefficients, or combinations `"a with b"`, that the rows do not determine.
-        root: R of the covariance R R^T of the model's parameters, (parameter, any).
-        residual: root mean square of the unexplained torque [N m; N].
-    """
-
-    model: FrictionModel
-    intervals: tuple[Interval, ...]
-    unidentifiable: tuple[str, ...]
-    root: Tensor
-    residual: float
+    model: FrictionModel  # of one joint, without gradients
+    intervals: tuple[Interval, ...]  # 95 % confidence intervals of constant coefficients
+    unidentifiable: tuple[str, ...]  # coefficients or combinations `"a with b"` without information
+    root: Tensor  # R of the covariance R R^T of the model's parameters, (parameter, any)
+    residual: float  # root mean square of the unexplained torque [N m; N]
     converged: bool = True
 
     @property

@@ -181,20 +181,16 @@ def sets_from_ranges(
 class FuzzyRules:
     """Gaussian sets over |velocity| and acceleration, and the coefficients of every pair of them.
 
-    Attributes:
-        lower, upper: trained range of both inputs, (joint, input).
-        centres, widths: of the sets of each input, (joint, set) each.
-        coefficients: of each rule, where the memberships of both of its sets are 1, (joint, rule,
-            coefficient); the rules of the first velocity set come first.
-        along_motion: whether acceleration is positive when the motion speeds up.
+    The coefficients of a rule are those where the memberships of both of its sets are 1; the rules
+    of the first velocity set come first.
     """
 
-    lower: Tensor
-    upper: Tensor
-    centres: tuple[Tensor, ...]
-    widths: tuple[Tensor, ...]
-    coefficients: Tensor
-    along_motion: bool
+    lower: Tensor  # of the trained range of both inputs, (joint, input)
+    upper: Tensor  # likewise
+    centres: tuple[Tensor, ...]  # of the sets of each input, (joint, set)
+    widths: tuple[Tensor, ...]  # likewise
+    coefficients: Tensor  # of each rule, (joint, rule, coefficient)
+    along_motion: bool  # whether acceleration is positive when the motion speeds up
 
     @property
     def constant(self) -> bool:

@@ -11,18 +11,13 @@ from torch import Tensor
 class GroupEvidence(NamedTuple):
     """Evidence for the prior precisions of groups, and updated precisions.
 
-    Attributes:
-        occam: log of the ratio of posterior to prior volume, in nats; minus the cost at the
-            optimum, this is the log evidence up to a constant.
-        gamma: number of parameters of each group that the data determine, (groups,).
-        slope: derivative of the log evidence by the log precision of each group, (groups,).
-        precision: new precision of each group, (groups,).
+    `occam` minus the cost at the optimum is the log evidence up to a constant.
     """
 
-    occam: float
-    gamma: Tensor
-    slope: Tensor
-    precision: Tensor
+    occam: float  # log of the ratio of posterior to prior volume, in nats
+    gamma: Tensor  # number of parameters of each group that the data determine, (groups,)
+    slope: Tensor  # derivative of the log evidence by the log precision of each group, (groups,)
+    precision: Tensor  # new precision of each group, (groups,)
 
 
 def group_evidence(

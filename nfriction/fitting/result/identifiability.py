@@ -25,16 +25,12 @@ NORMAL_95 = 1.959964
 
 @dataclass(frozen=True)
 class Interval:
-    """A fitted value and its 95 % confidence interval, within its bounds.
-
-    Attributes:
-        low, high: limits; at most the bounds, infinite where the data determine nothing.
-    """
+    """A fitted value and its 95 % confidence interval, within its bounds."""
 
     name: str
     value: float
-    low: float
-    high: float
+    low: float  # at least the lower bound; infinite where the data determine nothing
+    high: float  # at most the upper bound; likewise
 
     @property
     def sd(self) -> float:
@@ -44,17 +40,11 @@ class Interval:
 
 @dataclass(frozen=True)
 class Information:
-    """Information about the shared variables, the others marginalised.
+    """Information about the shared variables, the others marginalised."""
 
-    Attributes:
-        data: curvature due to the data, in units of one independent residual, (p, p).
-        prior: prior precision, (p,).
-        score: covariance of the data's gradient; None if equal to `data` (homoscedastic residuals).
-    """
-
-    data: Tensor
-    prior: Tensor
-    score: Tensor | None = None
+    data: Tensor  # curvature due to the data, in units of one independent residual, (p, p)
+    prior: Tensor  # prior precision, (p,)
+    score: Tensor | None = None  # covariance of the data's gradient; None if equal to `data`
 
     def subset(self, index: Tensor) -> "Information":
         """Information about some of the variables while the others are fixed."""
@@ -235,14 +225,11 @@ class CoefficientUncertainty:
     Linear theory around the fitted parameters, marginalised over the plant's terms and the windows'
     states.
 
-    Attributes:
-        schedule: whose parameters these are.
-        root: R of their covariance R R^T, (parameter, any); rows are infinite for
-            unidentifiable parameters, zero for parameters that were not fitted.
+    Rows of the root are infinite for unidentifiable parameters, zero for parameters not fitted.
     """
 
     schedule: Schedule
-    root: Tensor
+    root: Tensor  # R of their covariance R R^T, (parameter, any)
 
     @torch.no_grad()
     def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:

@@ -223,17 +223,11 @@ class StallMonitor:
 
 @dataclass(frozen=True, eq=False)
 class Continuation:
-    """The stages of a search, each with longer windows than the previous one.
+    """The stages of a search, each with longer windows than the previous one."""
 
-    Attributes:
-        stages: the stages that were kept, at least one.
-        skipped: lengths of the windows that were skipped [s].
-        reason: why the first of these was skipped; empty if the caller stopped the search.
-    """
-
-    stages: tuple[HorizonResult, ...]
-    skipped: tuple[float, ...] = ()
-    reason: Literal["", "too long", "lossy", "noisy"] = ""
+    stages: tuple[HorizonResult, ...]  # those that were kept, at least one
+    skipped: tuple[float, ...] = ()  # lengths of the windows that were skipped [s]
+    reason: Literal["", "too long", "lossy", "noisy"] = ""  # of the first; empty if stopped
 
     @property
     def end(self) -> HorizonResult:

@@ -63,16 +63,12 @@ DEFAULTS = ClassOptions()
 class AccelerationClasses:
     """Classes of acceleration along recordings.
 
-    Attributes:
-        labels: class of every sample, 0 to 2, (sample, joint) of each recording.
-        stands_for: class whose coefficients each class uses: itself, or a neighbour if it has too
-            few data, (joint, class).
-        notes: joints and classes with too few data, in words.
+    A class with too few data uses the coefficients of a neighbour.
     """
 
-    labels: tuple[Tensor, ...]
-    stands_for: Tensor
-    notes: tuple[str, ...]
+    labels: tuple[Tensor, ...]  # class of every sample, 0 to 2, (sample, joint) of each recording
+    stands_for: Tensor  # class whose coefficients each class uses, (joint, class)
+    notes: tuple[str, ...]  # joints and classes with too few data, in words
 
 
 def class_intervals(

@@ -236,25 +236,16 @@ def along(windows: Windows, classes: Sequence[Tensor]) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PositionError:
-    """Position error of simulated windows as a function of a schedule's parameter vector.
-
-    Args:
-        plant, friction: the mechanism and its friction, whose schedule is overwritten and restored.
-        windows: measured positions, with the states from which simulations start.
-        measurement: matrix (joint, joint) from joint coordinates to those of the recording.
-        drive: class of every sample (window, step, joint), instead of that of the simulation.
-        memory: hidden state at the start of each window, (window, joint, state_size).
-        threads: number of threads among which candidates are divided.
-    """
+    """Position error of simulated windows as a function of a schedule's parameter vector."""
 
     plant: Plant
-    friction: FrictionModel
-    windows: Windows
-    measurement: Tensor
+    friction: FrictionModel  # its schedule is overwritten and restored
+    windows: Windows  # measured positions, with the states from which simulations start
+    measurement: Tensor  # matrix (joint, joint) from joint coordinates to those of the recording
     substeps: int = 1
-    drive: Tensor | None = None
-    memory: Tensor | None = None
-    threads: int = 1
+    drive: Tensor | None = None  # class of every sample (window, step, joint), or by simulation
+    memory: Tensor | None = None  # hidden state at the starts, (window, joint, state_size)
+    threads: int = 1  # among which candidates are divided
 
     @property
     def values(self) -> int:
@@ -310,24 +301,15 @@ class PositionError:
 
 @dataclass(frozen=True, eq=False)
 class ClassFit:
-    """An adaptive model to be fitted, with the classes of its recordings.
+    """An adaptive model to be fitted, with the classes of its recordings."""
 
-    Attributes:
-        task: the fit, with encoder offsets removed.
-        motions: of the recordings, as recorded.
-        constant: fit of the constant law, from which every class starts.
-        classes, windows: of the recordings.
-        schedule: of the model to be fitted, set to these classes.
-        table, given: the coefficients varied by a fit with given classes, and their model.
-    """
-
-    task: FitTask
-    motions: tuple[Motion, ...]
-    constant: FitResult
+    task: FitTask  # the fit, with encoder offsets removed
+    motions: tuple[Motion, ...]  # as recorded
+    constant: FitResult  # fit of the constant law, from which every class starts
     classes: AccelerationClasses
-    schedule: Adaptive
-    table: GivenClasses
-    given: FrictionModel
+    schedule: Adaptive  # of the model to be fitted, set to these classes
+    table: GivenClasses  # coefficients varied by a fit with given classes
+    given: FrictionModel  # their model
     windows: Windows
 
     @classmethod

@@ -56,23 +56,15 @@ class SearchState:
     """An unfinished search in plain, JSON-compatible types, from which it can be resumed.
 
     A pattern search continues bit for bit; SQP restarts at the best point.
-
-    Attributes:
-        method: `"pattern"` or `"sqp"`.
-        point: best point, in the search's coordinates (see `Box`).
-        value: its cost; infinite before the first evaluation.
-        evaluations, iterations: numbers of candidates simulated and of iterations so far.
-        mesh: mesh size of a pattern search, in the same coordinates.
-        step: last successful move of a pattern search; zero if the last poll found nothing.
     """
 
     method: SearchMethod
-    point: list[float]
-    value: float
-    evaluations: int
+    point: list[float]  # best point, in the search's coordinates (see `Box`)
+    value: float  # its cost; infinite before the first evaluation
+    evaluations: int  # candidates simulated so far
     iterations: int = 0
-    mesh: float = INITIAL_MESH
-    step: Sequence[float] = ()
+    mesh: float = INITIAL_MESH  # size of that of a pattern search, in the same coordinates
+    step: Sequence[float] = ()  # last move of a pattern search; zero if the last poll found none
 
 
 @dataclass(frozen=True)
@@ -123,19 +115,13 @@ class SearchResult:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """The variables of a search, and their map to its internal coordinates of order 1.
-
-    Attributes:
-        start, lower, upper: (parameter,); equal bounds fix a parameter.
-        scale: a typical large change; in decades if logarithmic.
-        logarithmic: variables searched by their logarithm, bool; they must be positive.
-    """
+    """The variables of a search, and their map to its internal coordinates of order 1."""
 
     start: Tensor
-    lower: Tensor
+    lower: Tensor  # (parameter,); equal bounds fix a parameter
     upper: Tensor
-    scale: Tensor
-    logarithmic: Tensor
+    scale: Tensor  # a typical large change; in decades if logarithmic
+    logarithmic: Tensor  # variables searched by their logarithm, bool; they must be positive
 
     @property
     def free(self) -> Tensor:
@@ -486,17 +472,11 @@ def fit_by_search(
 
 @dataclass(frozen=True, eq=False)
 class _Objective:
-    """Negative log posterior of a table's parameters: position errors over their noise, and prior.
-
-    Attributes:
-        error: position error of candidates.
-        noise: its standard deviation, from the errors at the start; those at the end are unknown.
-        mean, sd: of the prior, (parameter,).
-    """
+    """Negative log posterior of a table's parameters: position errors over noise, and prior."""
 
     error: PositionError
-    noise: float
-    mean: Tensor
+    noise: float  # from the errors at the start; those at the end are unknown
+    mean: Tensor  # of the prior, (parameter,)
     sd: Tensor
 
     @classmethod

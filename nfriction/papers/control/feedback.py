@@ -22,18 +22,14 @@ Compensation = Callable[[Array, Array, Array], Array]
 class LinearPlant:
     """A discrete-time plant near a motion: x[k + 1] = A x[k] + B dtau[k], x = (q - q0, qd - qd0).
 
-    Attributes:
-        a: (*batch, 2 joint, 2 joint).
-        b: (*batch, 2 joint, joint).
-        q0, qd0: the motion [rad, rad/s], (*batch, joint).
-        acceleration: qdd of the motion, (*batch, joint), and its derivatives by x and by tau,
-            (*batch, joint, 2 joint) and (*batch, joint, joint).
+    `acceleration` is that of the motion, (*batch, joint), and its derivatives by x and by tau,
+    (*batch, joint, 2 joint) and (*batch, joint, joint).
     """
 
-    a: Array
-    b: Array
-    q0: Array
-    qd0: Array
+    a: Array  # (*batch, 2 joint, 2 joint)
+    b: Array  # (*batch, 2 joint, joint)
+    q0: Array  # of the motion [rad], (*batch, joint)
+    qd0: Array  # [rad/s]
     acceleration: tuple[Array, Array, Array]
 
     def __getitem__(self, k: int) -> LinearPlant:

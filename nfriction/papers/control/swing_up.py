@@ -25,17 +25,11 @@ CLOSED = 5e-4  # largest gap of an accepted plan, below the papers' encoder coun
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion from hanging to upright.
+    """A motion from hanging to upright."""
 
-    Attributes:
-        q, qd: at every sample except the last, which is upright and at rest [rad, rad/s],
-            (sample, joint).
-        tau: of the first joint, held over each sample [N m], (sample,).
-    """
-
-    q: Array
-    qd: Array
-    tau: Array
+    q: Array  # at every sample except the last, which is upright and at rest [rad], (sample, joint)
+    qd: Array  # at the same samples [rad/s]
+    tau: Array  # of the first joint, held over each sample [N m], (sample,)
 
 
 def plan_swing_up(

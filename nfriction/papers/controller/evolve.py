@@ -32,18 +32,15 @@ STRETCH = 3.0
 class TorqueSamples:
     """Motion of one joint and the friction torque that it implies.
 
-    Attributes:
-        qd, qdd, load: velocity [rad/s], acceleration [rad/s^2] and normal load [-], (sample,).
-        torque: friction torque [N m], (sample,).
-        block: consecutive samples over which errors are averaged. The torque of a smoothed motion
-            contains acceleration noise, which may exceed friction; averaging removes most of it.
+    The torque of a smoothed motion contains acceleration noise, which may exceed friction;
+    averaging removes most of it.
     """
 
-    qd: Tensor
-    qdd: Tensor
-    load: Tensor
-    torque: Tensor
-    block: int = 1
+    qd: Tensor  # [rad/s], (sample,)
+    qdd: Tensor  # [rad/s^2]
+    load: Tensor  # normal load [-]
+    torque: Tensor  # of friction [N m]
+    block: int = 1  # consecutive samples over which errors are averaged
 
 
 @dataclass(frozen=True)

@@ -105,18 +105,12 @@ class Rule:
 
 @dataclass(frozen=True)
 class RuleBase:
-    """Variables and rules of a Mamdani controller, validated.
+    """Variables and rules of a Mamdani controller, validated."""
 
-    Args:
-        name: purpose of the controller.
-        inputs, outputs: variables, in the order in which rules name their terms.
-        rules: in any order.
-    """
-
-    name: str
-    inputs: tuple[Variable, ...]
-    outputs: tuple[Variable, ...]
-    rules: tuple[Rule, ...]
+    name: str  # purpose of the controller
+    inputs: tuple[Variable, ...]  # in the order in which rules name their terms
+    outputs: tuple[Variable, ...]  # likewise
+    rules: tuple[Rule, ...]  # in any order
 
     def __post_init__(self) -> None:
         # Checked here and not in the readers, to include rules built in Python.

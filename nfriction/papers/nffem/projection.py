@@ -40,17 +40,12 @@ def one_group(network: FuzzyNetwork, group: int) -> FuzzyNetwork:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Affine map of inputs and outputs onto [-1, 1]: own = middle + half * scaled.
+    """Affine map of inputs and outputs onto [-1, 1]: own = middle + half * scaled."""
 
-    Args:
-        x_middle, x_half: shape (groups, inputs).
-        y_middle, y_half: shape (groups, outputs).
-    """
-
-    x_middle: Tensor
-    x_half: Tensor
-    y_middle: Tensor
-    y_half: Tensor
+    x_middle: Tensor  # (groups, inputs)
+    x_half: Tensor  # (groups, inputs)
+    y_middle: Tensor  # (groups, outputs)
+    y_half: Tensor  # (groups, outputs)
 
     @classmethod
     def of(cls, x: Tensor, y: Tensor) -> Scaling:

@@ -38,19 +38,14 @@ Drawing = Callable[[Workspace], Figure]
 class Item:
     """A table or figure of a paper.
 
-    Attributes:
-        title: its number and caption.
-        differs: difference between ours and the paper's, if there is one.
-        tables: caption and content, by file name.
-        figures: by file name.
-        models: models whose fit status is listed on the page.
+    Tables and figures are by file name.
     """
 
-    title: str
-    differs: str = ""
-    tables: Mapping[str, tuple[str, Table]] = field(default_factory=dict)
+    title: str  # its number and caption
+    differs: str = ""  # difference between ours and the paper's, if there is one
+    tables: Mapping[str, tuple[str, Table]] = field(default_factory=dict)  # caption and content
     figures: Mapping[str, Drawing] = field(default_factory=dict)
-    models: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()  # models whose fit status is listed on the page
 
 
 FIRST = (

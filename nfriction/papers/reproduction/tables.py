@@ -52,16 +52,11 @@ class Order(NamedTuple):
     """Verdict on neuro-fuzzy <= adaptive <= constant for each law on every joint.
 
     Judged by the median error over fresh releases.
-
-    Attributes:
-        holds: true if there are no exceptions.
-        broken: exceptions, in words.
-        best: the best of the nine by joint; ties in the printed digits are joined by "=".
     """
 
     holds: bool
-    broken: list[str]
-    best: dict[str, str]
+    broken: list[str]  # exceptions, in words
+    best: dict[str, str]  # of the nine by joint; ties in the printed digits are joined by "="
 
     def __str__(self) -> str:
         best = ", ".join(f"{joint} {model}" for joint, model in self.best.items())

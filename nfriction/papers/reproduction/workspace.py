@@ -32,39 +32,23 @@ Callback = Callable[..., None]
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that the results of a run depend on.
+    """Everything that the results of a run depend on."""
 
-    Attributes:
-        seed: for the encoders' errors, the controllers' samples and the searches.
-        tlrip_seconds, rtip_seconds: duration of each twin's recordings; 40 and 80 in the papers.
-        windows: lengths of the fits' windows [s].
-        max_steps: of the fits, at each window length.
-        terms, head_units: of the neuro-fuzzy models.
-        network_units: of the papers' network.
-        controller_samples: per joint, for training the papers' network.
-        search_horizon: length of the windows that a search simulates [s].
-        search_evaluations: limit on simulations of a search on the position error.
-        control_models: fitted to the driven rig, for friction compensation.
-        control_seconds: duration of each balanced motion [s].
-        fit_plant: also adjust inertia and gravity terms.
-        origin: origin of the recordings and further options of a run on data other than twins.
-    """
-
-    seed: int = 0
-    tlrip_seconds: float = 40.0
+    seed: int = 0  # for the encoders' errors, the controllers' samples and the searches
+    tlrip_seconds: float = 40.0  # duration of each twin's recordings; 40 and 80 in the papers
     rtip_seconds: float = 80.0
-    windows: tuple[float, ...] = (0.5, 2.0)
-    max_steps: int = 30
-    terms: tuple[int, int] = (5, 5)
+    windows: tuple[float, ...] = (0.5, 2.0)  # lengths of the fits' windows [s]
+    max_steps: int = 30  # of the fits, at each window length
+    terms: tuple[int, int] = (5, 5)  # of the neuro-fuzzy models, like the units of their head
     head_units: int = 10
-    network_units: int = 10
-    controller_samples: int = 40_000
-    search_horizon: float = 80.0
-    search_evaluations: int = 20_000
-    control_models: tuple[str, ...] = study.MODELS
-    control_seconds: float = 16.0
-    fit_plant: bool = False
-    origin: str = ""
+    network_units: int = 10  # of the papers' network
+    controller_samples: int = 40_000  # per joint, for training the papers' network
+    search_horizon: float = 80.0  # length of the windows that a search simulates [s]
+    search_evaluations: int = 20_000  # limit on simulations of a search on the position error
+    control_models: tuple[str, ...] = study.MODELS  # fitted to the driven rig; compensate friction
+    control_seconds: float = 16.0  # duration of each balanced motion [s]
+    fit_plant: bool = False  # also adjust inertia and gravity terms
+    origin: str = ""  # of the recordings, and further options of a run on data other than twins
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -97,20 +81,13 @@ QUICK = Settings(
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A rig without friction and its recordings.
-
-    Attributes:
-        plant: the rig.
-        train, test: recordings for fitting and for testing.
-        motions: smoothed motion of each, training first, in joint coordinates.
-        states: exact q0 and qd0 by recording, if known.
-    """
+    """A rig without friction and its recordings."""
 
     plant: Plant
-    train: list[Recording]
-    test: list[Recording]
-    motions: list[Motion]
-    states: Mapping[str, tuple[Array, Array]]
+    train: list[Recording]  # for fitting
+    test: list[Recording]  # for testing
+    motions: list[Motion]  # smoothed motion of each, training first, in joint coordinates
+    states: Mapping[str, tuple[Array, Array]]  # exact q0 and qd0 by recording, if known
 
     @property
     def train_motions(self) -> list[Motion]:

@@ -49,22 +49,14 @@ V_SMOOTH = 0.01
 
 
 class Parameter(NamedTuple):
-    """A parameter of the friction, drawn uniformly for every joint.
+    """A parameter of the friction, drawn uniformly for every joint."""
 
-    Attributes:
-        effect: the truth to which it belongs; empty if every truth has it.
-        low, high: smallest and largest value, for all joints or for each.
-        absent: the value if the truth lacks the effect.
-        meaning: symbol, unit and name.
-        signed: both signs are equally likely.
-    """
-
-    effect: str
-    low: float | Vector
-    high: float | Vector
-    absent: float
-    meaning: str
-    signed: bool = False
+    effect: str  # the truth to which it belongs; empty if every truth has it
+    low: float | Vector  # smallest value, for all joints or for each
+    high: float | Vector  # largest value
+    absent: float  # the value if the truth lacks the effect
+    meaning: str  # symbol, unit and name
+    signed: bool = False  # both signs are equally likely
 
 
 PARAMETERS = {

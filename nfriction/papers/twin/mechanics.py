@@ -35,18 +35,15 @@ Progress = Callable[[float], object]
 class Links:
     """Constants of three links on a fixed pivot.
 
-    Attributes:
-        mass, com, length: mass of each link [kg], distance to its mass centre and next joint [m].
-        coupling: a22, a33, a44, a23, a24, a34 in the paper's numbering [kg m^2].
-        gravity, moment: [m/s^2], and g b_i [N m].
+    Numbered as in the paper, couplings in kg m^2.
     """
 
-    mass: Vector
-    com: Vector
-    length: Vector
-    coupling: tuple[float, float, float, float, float, float]
-    gravity: float
-    moment: Vector
+    mass: Vector  # of each link [kg]
+    com: Vector  # distance to its mass centre [m]
+    length: Vector  # distance to the next joint [m]
+    coupling: tuple[float, float, float, float, float, float]  # a22, a33, a44, a23, a24, a34
+    gravity: float  # [m/s^2]
+    moment: Vector  # g b_i [N m]
 
     @classmethod
     def of(cls, plant: PendulumChain) -> Links:
@@ -121,17 +118,12 @@ class HiddenFriction:
 
 @dataclass(frozen=True, eq=False)
 class TrueMotion:
-    """The true motion in joint coordinates, each (sample, joint).
+    """The true motion in joint coordinates, each (sample, joint)."""
 
-    Attributes:
-        q, qd, qdd: [rad, rad/s, rad/s^2].
-        tau_f: friction torque, on the left of M(q) qdd + bias + tau_f = 0 [N m].
-    """
-
-    q: Array
-    qd: Array
-    qdd: Array
-    tau_f: Array
+    q: Array  # [rad]
+    qd: Array  # [rad/s]
+    qdd: Array  # [rad/s^2]
+    tau_f: Array  # of friction, on the left of M(q) qdd + bias + tau_f = 0 [N m]
 
 
 _State = tuple[float, float, float, float, float, float]
