@@ -73,12 +73,9 @@ def run_twin(arguments: argparse.Namespace) -> int:
     family.effects_of(arguments.truth)  # before a folder is made
     check_writable(arguments.out)
     simulated = family.build(
-        arguments.truth,
-        arguments.out,
-        seed=arguments.seed,
-        duration=arguments.seconds,
+        arguments.truth, arguments.out, seed=arguments.seed, duration=arguments.seconds,
         progress=sys.stderr.isatty(),
-    )
+    )  # fmt: skip
     train, test = simulated.part("train"), simulated.part("test")
     print(
         f"{simulated.name}: {len(train)} recordings of {arguments.seconds:g} s for training, "

@@ -697,8 +697,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
     curvature = 2 * torch.einsum("bsj,s->bj", blocks, parabola) / parabola.square().sum()
     curvature = curvature.repeat_interleave(given.block, 0)
     for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
-        part = torch.zeros_like(given.tau)
-        part[:, j] = curvature[:, j]
+        part = torch.where(torch.arange(plant.joints) == j, curvature, 0.0)
         ratio = -_balance(given, given.tau - needed, part)[1]
         if ratio > 0:
             text = (
@@ -852,8 +851,7 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     """Each driven joint with a spring to the frame, whose rest is anywhere."""
     needed = given.needed(plant)
     for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
-        part = torch.zeros_like(given.tau)
-        part[:, j] = given.q[:, j]
+        part = torch.where(torch.arange(plant.joints) == j, given.q, 0.0)
         stiffness = -_balance(given, given.tau - needed, part)[1]
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (

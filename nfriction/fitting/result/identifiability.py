@@ -223,9 +223,7 @@ class CoefficientUncertainty:
     """Posterior of a schedule's parameters, propagated to its coefficients.
 
     Linear theory around the fitted parameters, marginalised over the plant's terms and the windows'
-    states.
-
-    Rows of the root are infinite for unidentifiable parameters, zero for parameters not fitted.
+    states. Rows of the root are infinite for unidentifiable parameters, zero for fixed ones.
     """
 
     schedule: Schedule

@@ -87,14 +87,11 @@ _TLRIP = Specification(
 # Ball bearings in the first two joints, a bushing in the last, and less grease.
 _RTIP = Specification(
     rig=rigs.rtip,
-    friction=HiddenFriction(
+    friction=replace(
+        _TLRIP.friction,
         seal=(8e-4, 8e-4, 3e-3),
         bearing_arm=(5e-5, 5e-5, 2e-4),
-        stribeck_rise=(0.6, 0.5, 0.4),
-        stribeck_velocity=(0.3, 0.4, 0.5),
-        asymmetry=(0.06, -0.05, 0.04),
         viscous=(1e-2, 1.5e-2, 3e-2),
-        shear_velocity=(4.0, 5.0, 6.0),
     ),
     # As in the RTIP paper.
     duration=80.0,
