@@ -232,9 +232,7 @@ def trace(
 ) -> Program:
     """Run `function(**inputs)` symbolically; it returns a tensor or a tuple of tensors.
 
-    Args:
-        inputs: example tensors, float64; each becomes a separate input.
-        parameters: names of the inputs that stay the same over many calls.
+    The inputs are float64 examples, those named in `parameters` the same over many calls.
     """
     graph, ports, arguments = Graph(), [], {}
     for name, example in inputs.items():

@@ -373,13 +373,9 @@ def estimate_starts(
 
     Gauss-Newton on the squared errors, weighted by the sensor's noise, with the kinematic estimate
     from a cubic through the lead-in as a weak prior, because friction may stop a joint so soon that
-    the motion does not depend on its velocity.
-
-    Args:
-        simulate: positions (*batch, window, sample, joint) from states (*batch, window, 2 joint).
-        time: of the samples [s], (window, sample).
-        y: measured positions, (window, sample, joint).
-        quantum: one count of the encoders, a number or (joint,); 0 where unknown.
+    the motion does not depend on its velocity. `simulate` gives positions (*batch, window, sample,
+    joint) from states (*batch, window, 2 joint); `quantum` is one count of the encoders, 0 where
+    unknown.
     """
     count = y.shape[1]
     time = time - time[:, :1]

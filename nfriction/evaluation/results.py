@@ -120,7 +120,6 @@ def write_results(
     first file of this run appears; `results.json` comes last. The user's own files stay.
 
     Args:
-        folder: made if it does not exist.
         selection: the choice on the training recordings alone, if there is one.
         command: command line that reproduces the results.
         formats: of figures besides PNG, see `plots.save_all`.

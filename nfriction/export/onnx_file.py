@@ -50,9 +50,7 @@ class Unknown(int):
 class OnnxGraph:
     """Nodes, and constants by name, of a decomposed torch program with a dynamic first axis.
 
-    Args:
-        inputs, outputs: names in the ONNX graph, in the program's order.
-        real: type of its floating-point tensors, `np.float64` or `np.float32`.
+    Inputs and outputs are named in the program's order; `real` is the type of its floats.
     """
 
     def __init__(

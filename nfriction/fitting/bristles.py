@@ -41,10 +41,8 @@ MOST_NUMBERS = 2_000_000
 def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]]) -> MemoryFit:
     """Fit a law of one bristle to the rows of a joint in order of time.
 
-    Args:
-        law: with coefficients F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2, mu_d
-            and mu_b.
-        blocks: rows that are held out in turn; shapes and forces are fitted to the others.
+    Shapes and forces are fitted to the rows outside of each block in turn. The law has coefficients
+    F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2, mu_d and mu_b.
     """
     reach, fastest = range_of(joint), float(np.abs(joint.qd).max())
     limits = {

@@ -48,16 +48,10 @@ UNITS_OF_INERTIA = {"g m^2": 1e-3, "kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake that would explain why no friction fits.
+    """A mistake that would explain why no friction fits."""
 
-    Attributes:
-        text: a clause such as "the sign of joint2's position is reversed".
-        unexplained: share of the torque that friction does not explain after the correction [-];
-            NaN if no correction is known.
-    """
-
-    text: str
-    unexplained: float
+    text: str  # a clause such as "the sign of joint2's position is reversed"
+    unexplained: float  # share of the torque after the correction [-]; NaN if none is known
 
 
 @dataclass(frozen=True)
@@ -113,17 +107,15 @@ def likely_mistakes(
 ) -> tuple[float, tuple[Mistake, ...]]:
     """Share of unexplained torque as recorded, and mistakes whose correction reduces it greatly.
 
+    These are the mistakes that the data support, best first: several if the data do not distinguish
+    them, none if no correction divides the share [-] by `diagnosis_ratio`, or if the share is at
+    most this times that of the noise.
+
     Args:
-        plant: the mechanism as given.
         recordings: in joint coordinates.
         motions: of the recordings, smoothed.
         convention: of the recorded angles.
         zeroed: encoders were set to zero at the start of each recording, in any pose.
-
-    Returns:
-        The share [-], and the mistakes that the data support, best first: several if the data do
-        not distinguish them, none if no correction divides the share by `diagnosis_ratio`, or if
-        the share is at most this times that of the noise.
     """
     given = _collect(recordings, motions, options)
     # These spoil the balance, and a fit absorbs some wrong times in the inertia.

@@ -236,11 +236,7 @@ def steady_law(law: Law) -> Law:
 def regress(
     law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
 ) -> TorqueFit:
-    """Least squares of the kept samples of torque balances; see `fit_equation_error`.
-
-    Raises:
-        ValueError: if the law's torque is not finite along the motion.
-    """
+    """Least squares of the kept samples of torque balances; errors as of `fit_equation_error`."""
     torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
     regression = _Regression(law, parts, torque, kept, kept.to(torque), v_smooth, options)
     coefficients, starts = regression.solve()

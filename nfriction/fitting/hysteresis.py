@@ -92,10 +92,8 @@ def deflections(path: Array, widths: Array, start: Array, every: int = 1) -> Arr
 def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: bool) -> MemoryFit:
     """Fit the law `friction.hysteresis` to the rows of a joint in order of time.
 
-    Args:
-        blocks: rows that are held out in turn; a term or a smaller ridge is used only if it lowers
-            the error there by more than chance.
-        loaded: friction is proportional to the load.
+    A term or a smaller ridge is used only if it lowers the error on held-out blocks by more than
+    chance. Friction is proportional to the load if `loaded`.
     """
     path, grid = path_of(joint), range_of(joint) * np.geomspace(*SPAN, COUNT)
     every = max(1, len(joint) // START_ROWS)

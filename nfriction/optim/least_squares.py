@@ -35,19 +35,12 @@ MESSAGES: dict[str, str] = {
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """Second-order model of a sum of squares at one point.
+    """Second-order model of a sum of squares at one point."""
 
-    Args:
-        cost: half the sum of squared residuals.
-        gradient: J^T r, shape (p,).
-        hessian: Gauss-Newton J^T J (or any positive semidefinite curvature), shape (p, p).
-        blocks: first row and block size of the block-diagonal last part of the Hessian, if any.
-    """
-
-    cost: float | Tensor
-    gradient: Tensor
-    hessian: Tensor
-    blocks: tuple[int, int] | None = None
+    cost: float | Tensor  # half the sum of squared residuals
+    gradient: Tensor  # J^T r, (p,)
+    hessian: Tensor  # J^T J or any positive semidefinite curvature, (p, p)
+    blocks: tuple[int, int] | None = None  # first row and size of the block-diagonal last blocks
 
     @property
     def finite(self) -> bool:
@@ -86,29 +79,18 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresResult:
-    """Outcome of a least-squares fit; check `converged` before using `x`.
+    """Outcome of a least-squares fit; check `converged` before using `x`."""
 
-    Args:
-        x: best parameters, shape (p,).
-        cost: half the sum of squares at `x`.
-        gradient: at `x`, shape (p,), not projected.
-        hessian: Gauss-Newton Hessian at `x`, shape (p, p).
-        status: reason why the search ended; `message` describes it in words.
-        evaluations: costs evaluated, including rejected trials.
-        at_lower, at_upper: which parameters lie on a bound, shape (p,), bool.
-        history: one `Step` per accepted step.
-    """
-
-    x: Tensor
-    cost: float
-    gradient: Tensor
-    hessian: Tensor
-    status: Status
+    x: Tensor  # best parameters, (p,)
+    cost: float  # half the sum of squares at `x`
+    gradient: Tensor  # at `x`, (p,), not projected
+    hessian: Tensor  # of Gauss and Newton at `x`, (p, p)
+    status: Status  # reason why the search ended; `message` describes it in words
     steps: int
-    evaluations: int
-    at_lower: Tensor
+    evaluations: int  # costs evaluated, including rejected trials
+    at_lower: Tensor  # which parameters lie on a bound, (p,), bool
     at_upper: Tensor
-    history: list[Step]
+    history: list[Step]  # one per accepted step
 
     @property
     def converged(self) -> bool:

@@ -39,9 +39,7 @@ def count_seen(q: ArrayLike) -> Array:
     It is the smallest change from one sample to the next if 1 % of the changes equal it: the
     smallest change of noise, or of numbers with many digits, hardly recurs. A joint that never
     stops changes by many counts at once, so for it the differences of changes are taken instead.
-
-    Args:
-        q: positions as read from the encoder [rad or m], shape (..., time, joint).
+    Positions (..., time, joint) are as read from the encoder.
     """
     q = np.asarray(q, dtype=np.float64)
     found = np.full(q.shape[-1], np.nan)

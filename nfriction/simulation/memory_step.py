@@ -67,14 +67,9 @@ def memory_step(
     step: Tensor | float,
     state: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One step with coefficients, torque and friction held.
+    """One step with coefficients, torque and friction held, as `rk4_step` for a law with memory.
 
-    Args:
-        plant, ..., step: as for `rk4_step`; the friction's law has memory.
-        state: of the law at the start, (*batch, joint, state).
-
-    Returns:
-        q and qd at the end of the step, qdd at its start, and the law's state at the end.
+    `state` is that of the law at the start, (*batch, joint, state); returned last at the end.
     """
     law = memory_of(friction)
     assert law is not None

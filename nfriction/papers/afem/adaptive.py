@@ -17,12 +17,7 @@ CLASSES = ("low", "medium", "high")
 
 
 def peak_envelope(size: Tensor, fading: Tensor | float) -> Tensor:
-    """Causal envelope of a series: `e_k = max(size_k, fading e_(k-1))`.
-
-    Args:
-        size: not negative, (sample, ...).
-        fading: fraction of a peak that remains after one sample, between 0 and 1.
-    """
+    """Causal envelope of a series: `e_k = max(size_k, fading e_(k-1))`, along the first axis."""
     # max of size_i f^(k-i) over i <= k, as a running maximum of logarithms.
     steps = torch.arange(len(size), dtype=size.dtype, device=size.device)
     fade = torch.log(torch.as_tensor(fading, dtype=size.dtype, device=size.device)) * steps

@@ -100,12 +100,9 @@ def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
 
 
 def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weights) -> list[Gains]:
-    """Gains at every sample of a motion that starts at rest and ends at an equilibrium.
+    """Gains at every sample of a motion that starts at rest and ends at the equilibrium `top`.
 
-    Args:
-        way: the plant along the motion, (sample, ...).
-        torque: of the first joint along it [N m], (sample,).
-        top: the plant at its end.
+    `torque` is that of the first joint [N m], (sample,).
 
     References:
         Riccati recursions, backward for the feedback, forward for the Kalman filter.

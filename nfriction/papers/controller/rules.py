@@ -145,11 +145,7 @@ def load_rules(path: str | Path) -> RuleBase:
 
 
 def read_text(path: Path) -> str:
-    """Text of a rule file.
-
-    Raises:
-        ValueError: if the file is too large or not UTF-8; the message names the file.
-    """
+    """Text of a rule file; raises ValueError if it is too large or not UTF-8."""
     # Before it is read into memory.
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path.name}: rule files are at most {MAX_BYTES} bytes.")

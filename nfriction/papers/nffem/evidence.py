@@ -93,30 +93,18 @@ class EvidenceOptions:
 
 @dataclass(frozen=True, eq=False)
 class EvidenceResult:
-    """Outcome of a fit by evidence; check `converged` before using it.
+    """Outcome of a fit by evidence; check `converged` before using it."""
 
-    Args:
-        status: reason for termination; `message` describes it in words.
-        w: parameters in one vector, shape (p,).
-        alpha, gamma: prior precision and effective number of parameters, by group.
-        beta: noise precision; the noise variance is 1 / (2 beta), in the targets' unit squared.
-        error_squares: E_D.
-        parameter_squares: E_g = sum (w - w0)^2, by group.
-        samples: n, number of errors in E_D.
-        log_evidence: in nats, with all constants, so models of the same data can be compared.
-        covariance: posterior covariance of the parameters, shape (p, p).
-    """
-
-    status: Status
-    w: Tensor
-    alpha: dict[str, float]
-    beta: float
-    gamma: dict[str, float]
-    error_squares: float
-    parameter_squares: dict[str, float]
-    samples: int
-    log_evidence: float
-    covariance: Tensor
+    status: Status  # reason for termination; `message` describes it in words
+    w: Tensor  # parameters, (p,)
+    alpha: dict[str, float]  # prior precision by group
+    beta: float  # noise precision; the noise variance is 1 / (2 beta), in the targets' unit squared
+    gamma: dict[str, float]  # effective number of parameters by group
+    error_squares: float  # E_D
+    parameter_squares: dict[str, float]  # E_g = sum (w - w0)^2, by group
+    samples: int  # n, number of errors in E_D
+    log_evidence: float  # in nats, with all constants, so models of the same data can be compared
+    covariance: Tensor  # posterior covariance of the parameters, (p, p)
     steps: int
 
     @property
@@ -418,14 +406,8 @@ def reestimate(
 ) -> tuple[Tensor, float]:
     """MacKay's fixed-point update: alpha_g = gamma_g / (2 E_g), beta = (n - gamma) / (2 E_D).
 
-    A group still at the centre of its prior keeps its alpha: it has no information yet.
-
-    Args:
-        known: `posterior` at the current alpha and beta.
-        local, groups, samples, alpha: those of this posterior.
-        largest_beta: limit from a known noise floor.
-    Returns:
-        The new alpha, shape (groups,), and beta.
+    A group still at the centre of its prior keeps its alpha: it has no information yet. `known` is
+    the `posterior` of the other arguments, `largest_beta` the limit from a known noise floor.
     """
     curvature = group_sums(local.JtJ.diagonal(), groups, len(alpha))
     # As many parameters as samples would leave no noise at all.

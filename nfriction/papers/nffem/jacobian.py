@@ -75,13 +75,9 @@ def assign(module: nn.Module, vector: Tensor) -> None:
 def jacobian_pieces(
     model: nn.Module, inputs: Tensor
 ) -> Iterator[tuple[slice, Tensor, tuple[Tensor, ...]]]:
-    """Differentiate a model by its parameters, one chunk of samples after another.
+    """Differentiate any module by its parameters, one chunk of samples (n, ...) after another.
 
-    Args:
-        model: any module.
-        inputs: shape (n, ...).
-    Yields:
-        Slice of the samples, their outputs (m, *outputs), one Jacobian (m, p) for each output.
+    Yields slice of the samples, outputs (m, *outputs), one Jacobian (m, p) for each output.
     """
     parameters = trainable(model)
     vector = flatten(parameters)

@@ -110,14 +110,9 @@ def missed_torque(twin: Twin) -> dict[str, float]:
 
     A table contains the mean torque in cells with equally many samples of the training motion and
     predicts the torque along the test motion. No coefficients of the same inputs can do much
-    better, so this is the cost of the choice of inputs, for any network.
-
-    Args:
-        twin: with releases of both splits; its truth is used only for testing.
-
-    Returns:
-        Ratio of RMS error to RMS torque, averaged over the joints, for "speed" and for "speed and
-        acceleration" (along the motion).
+    better, so this is the cost of the choice of inputs, for any network. Returns the ratio of RMS
+    error to RMS torque, averaged over the joints, for "speed" and for "speed and acceleration"
+    (along the motion).
     """
     train, test = _motion(twin, "train"), _motion(twin, "test")
     shares = [_shares(train[:, :, k], test[:, :, k]) for k in range(twin.plant.joints)]

@@ -91,15 +91,8 @@ def train_on_samples(
 ) -> tuple[NeuroFuzzyModel, list[EvidenceResult]]:
     """A model whose coefficients are radial basis networks trained on controllers' samples.
 
-    Args:
-        law: of the coefficients that the controllers give.
-        controllers: one per joint; the model stays within their universes.
-        samples: along a measured motion.
-        units: of each network; 10 in the paper.
-        v_smooth: of the model's smooth sign [rad/s].
-
-    Returns:
-        The model, without gradients, and the fit of each joint's network.
+    Returns it, without gradients, and the fit of each joint's network. Each joint has a controller,
+    in whose universe the model stays.
 
     Raises:
         ValueError: if the law has no neuro-fuzzy model.
