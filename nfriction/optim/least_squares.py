@@ -40,7 +40,7 @@ class Quadratic:
     cost: float | Tensor  # half the sum of squared residuals
     gradient: Tensor  # J^T r, (p,)
     hessian: Tensor  # J^T J or any positive semidefinite curvature, (p, p)
-    blocks: tuple[int, int] | None = None  # first row and size of the block-diagonal last blocks
+    blocks: tuple[int, int] | None = None  # first row, block size of the block-diagonal last part
 
     @property
     def finite(self) -> bool:

@@ -82,10 +82,8 @@ def information(
 def covariance_root(known: Information) -> Tensor:
     """R of the posterior covariance R R^T, (p, p); rows are infinite without information.
 
-    With a score it is the sandwich covariance H^-1 (score + prior) H^-1.
-
-    References:
-        H. White, Econometrica 50 (1982), 1-25.
+    With a score it is the sandwich covariance H^-1 (score + prior) H^-1 (H. White, Econometrica 50
+    (1982), 1-25).
     """
     scale, values, vectors = scaled_spectrum(known.data + torch.diag(known.prior))
     floor = torch.finfo(values.dtype).eps * len(values)

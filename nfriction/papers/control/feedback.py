@@ -82,11 +82,7 @@ class Gains:
 
 
 def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
-    """Steady-state gains at an equilibrium, else ValueError; only the first joint has a drive.
-
-    References:
-        Discrete algebraic Riccati equation (`scipy.linalg.solve_discrete_are`).
-    """
+    """Steady-state gains at an equilibrium, else ValueError; only the first joint has a drive."""
     from scipy.linalg import solve_discrete_are
 
     if np.abs(linear.acceleration[0]).max() > 1e-9:
@@ -102,10 +98,8 @@ def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
 def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weights) -> list[Gains]:
     """Gains at every sample of a motion that starts at rest and ends at the equilibrium `top`.
 
-    `torque` is that of the first joint [N m], (sample,).
-
-    References:
-        Riccati recursions, backward for the feedback, forward for the Kalman filter.
+    Riccati recursions, backward for the feedback, forward for the Kalman filter. `torque` is that
+    of the first joint [N m], (sample,).
     """
     from scipy.linalg import solve_discrete_are
 

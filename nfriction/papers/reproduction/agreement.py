@@ -51,10 +51,8 @@ def agreement(plant: PendulumChain, q0: Array, qd0: Array) -> pd.DataFrame:
     """Largest difference from the library's motion up to each horizon [rad], by simulation.
 
     The last row is for a start off by 1e-12 rad: chaotic motion amplifies round-off, so no two
-    programs agree better than that for long.
-
-    References:
-        TLRIP paper, Figs. 3 and 4: equations and SimMechanics "match exactly".
+    programs agree better than that for long. In the TLRIP paper, Figs. 3 and 4, equations and
+    SimMechanics "match exactly".
     """
     steps = round(1000 * HORIZONS[-1])
     found = simulations(plant, q0, qd0, steps)

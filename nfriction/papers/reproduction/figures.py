@@ -41,13 +41,10 @@ _CELLS = 81  # cells of a map along each axis
 
 
 def inertia_cases() -> Figure:
-    """Frictionless swings of the TLRIP rig with its arm free, one panel per joint.
+    """Frictionless swings of the TLRIP rig with its arm free, by joint (TLRIP paper, Fig. 2).
 
     Links as point masses, with only the printed Izz, and with a full tensor (`FULL_TENSOR`; the
     paper prints none). The last two nearly agree while the arm turns slowly, and diverge later.
-
-    References:
-        TLRIP paper, Fig. 2.
     """
     cases = {
         "inertia neglected": rigs.tlrip("free", "none"),
@@ -58,12 +55,9 @@ def inertia_cases() -> Figure:
 
 
 def second_swing() -> Figure:
-    """Frictionless swing of the RTIP rig with its arm free, one panel per joint.
+    """Frictionless swing of the RTIP rig with its arm free, by joint (RTIP paper, Fig. 3).
 
     Angles are measured from hanging, as in that paper.
-
-    References:
-        RTIP paper, Fig. 3.
     """
     return _swings({"without friction": rigs.rtip("free")}, 2.0 * INERTIA_SECONDS)
 
@@ -92,13 +86,10 @@ def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
 
 
 def without_friction(workspace: Workspace) -> Figure:
-    """Measured positions and frictionless simulations from the same release.
+    """Measured positions and frictionless simulations from one release (TLRIP paper, Fig. 4).
 
     One simulation is by the library, one by the twin's own mechanics, which share no code with it,
     and one by MuJoCo if installed; the paper compares its equations with SimMechanics.
-
-    References:
-        TLRIP paper, Fig. 4.
     """
     bench = workspace.bench("tlrip")
     recording = next(r for r in bench.test if r.name == SHOWN)
@@ -142,11 +133,7 @@ def network_surfaces(workspace: Workspace) -> Figure:
 
 
 def coefficients(workspace: Workspace, name: str) -> Figure:
-    """Coefficients of a neuro-fuzzy model over the friction experiment, one column per joint.
-
-    References:
-        TLRIP paper, Figs. 11 to 13.
-    """
+    """Coefficients of a network over the experiment, by joint (TLRIP paper, Figs. 11 to 13)."""
     (moved,) = workspace.bench(EXPERIMENT).motions
     models = {name: load(workspace.model(name))}
     return coefficients_over_time(models, moved, joint_names=tables.JOINTS)
@@ -155,11 +142,7 @@ def coefficients(workspace: Workspace, name: str) -> Figure:
 def group_positions(
     workspace: Workspace, models: Sequence[str], among: Sequence[str] = tables.NINE
 ) -> Figure:
-    """Measured and simulated positions of these models, with errors also on the scale of others.
-
-    References:
-        TLRIP paper, Fig. 14 (of NFNLFM).
-    """
+    """Measured and simulated positions, errors on a common scale (TLRIP paper, Fig. 14)."""
     recording = next(r for r in workspace.bench("tlrip").test if r.name == SHOWN)
     simulated = {name: workspace.arrays(name)[SHOWN] for name in among}
     return _on_one_scale(recording, simulated, models)
@@ -194,11 +177,7 @@ def fresh_errors(workspace: Workspace) -> Figure:
 
 
 def second_torque(workspace: Workspace) -> Figure:
-    """Friction torque of each law over velocity on the second paper's rig, one panel per joint.
-
-    References:
-        RTIP paper, Fig. 8.
-    """
+    """Friction torque of each law over velocity, by joint (RTIP paper, Fig. 8)."""
     bench = workspace.bench("rtip")
     models = {law: load(workspace.model(f"rtip-{law}")) for law in LAWS}
     return torque_over_velocity(bench.plant, models, bench.train, bench.train_motions)
@@ -207,10 +186,8 @@ def second_torque(workspace: Workspace) -> Figure:
 def experiment(workspace: Workspace) -> Figure:
     """Position, velocity and acceleration of the friction experiment, one column per joint.
 
-    Shaded by the class of acceleration found; a strip at the top shows the printed classes.
-
-    References:
-        TLRIP paper, Table 6.
+    Shaded by the class of acceleration found; a strip at the top shows the printed classes (TLRIP
+    paper, Table 6).
     """
     (moved,) = workspace.bench(EXPERIMENT).motions
     intervals = workspace.found(ADAPTIVE[-1])["intervals"]
@@ -250,11 +227,7 @@ def experiment(workspace: Workspace) -> Figure:
 
 
 def controller_memberships() -> Figure:
-    """Fuzzy sets of the inputs and outputs of joint 2's controller, one panel each.
-
-    References:
-        TLRIP paper, Fig. 7 and Table 4.
-    """
+    """Fuzzy sets of joint 2's controller, one panel each (TLRIP paper, Fig. 7 and Table 4)."""
     rules = paper_controller(2).rule_base
     figure, axes = style.panels(2, 2, style.PAGE, 3.6, sharey=True)
     for row, variables in zip(axes, (rules.inputs, rules.outputs), strict=True):
@@ -265,11 +238,7 @@ def controller_memberships() -> Figure:
 
 
 def second_positions(workspace: Workspace, law: str) -> Figure:
-    """Measured and simulated positions on the second paper's rig, the first ten seconds.
-
-    References:
-        RTIP paper, Figs. 5 to 7.
-    """
+    """Measured and simulated positions on the second rig, first 10 s (RTIP paper, Figs. 5 to 7)."""
     recording = next(r for r in workspace.bench("rtip").test if r.name == SECOND_SHOWN)
     first = recording[recording.time < recording.time[0] + SECOND_SECONDS]
     simulated = {

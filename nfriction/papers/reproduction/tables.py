@@ -95,11 +95,7 @@ def fresh_runs(workspace: Workspace, models: Sequence[str]) -> dict[str, Array]:
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
-    """Position RMSE of every model on test releases, with the paper's values.
-
-    References:
-        TLRIP paper, Table 10.
-    """
+    """Position RMSE of every model on test releases, beside Table 10 of the TLRIP paper."""
     return _beside(rmse(workspace, TLRIP, drive=drive), _table(_PRINTED_10))
 
 
@@ -112,11 +108,7 @@ def agreement_table() -> pd.DataFrame:
 
 
 def table_6(workspace: Workspace) -> pd.DataFrame:
-    """Classes of acceleration in the friction experiment, their start and end [s].
-
-    References:
-        TLRIP paper, Table 6.
-    """
+    """Classes of acceleration, their start and end [s], beside Table 6 of the TLRIP paper."""
     found = workspace.found(ADAPTIVE[-1])["intervals"]
 
     def rows(by_joint: Mapping[str, Sequence[Sequence[Any]]]) -> pd.DataFrame:
@@ -135,11 +127,7 @@ def table_6(workspace: Workspace) -> pd.DataFrame:
 
 
 def adaptive_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
-    """Coefficients of an adaptive model by class, by both methods; the printed ones are lost.
-
-    References:
-        TLRIP paper, Tables 7 to 9.
-    """
+    """Adaptive coefficients by class, by both methods; the TLRIP paper's Tables 7 to 9 are lost."""
 
     def by(stage: str) -> pd.DataFrame:
         classes = workspace.found(stage)["classes"].items()
@@ -152,12 +140,10 @@ def adaptive_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 
 
 def table_11(workspace: Workspace) -> pd.DataFrame:
-    """Error reduction of NFNLFM relative to each other model [%], 11.57 to 94.55 in print.
+    """Error reduction of NFNLFM relative to each other model [%] (TLRIP paper, Table 11).
 
-    The printed values follow from the printed Table 10, which has no constant models.
-
-    References:
-        TLRIP paper, Table 11.
+    The printed values, 11.57 to 94.55, follow from the printed Table 10, which has no constant
+    models.
     """
     best, others = NEURO_FUZZY[-1], (*ADAPTIVE, *NEURO_FUZZY[:-1], *CONSTANT)
     return _saved(workspace, {other: (best, other) for other in others})
@@ -196,21 +182,13 @@ def _saved(workspace: Workspace, pairs: Mapping[str, tuple[str, str]]) -> pd.Dat
 
 
 def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
-    """Coefficients of a model on the second paper's rig, with the paper's values.
-
-    References:
-        RTIP paper, Tables I to III.
-    """
+    """Coefficients of a model on the second rig, beside the RTIP paper's Tables I to III."""
     found = workspace.found(f"rtip-{law}")["coefficients"]
     return _beside(_table(found), _table(SECOND_COEFFICIENTS[law]))
 
 
 def second_table_4(workspace: Workspace) -> pd.DataFrame:
-    """Position RMSE on the second paper's rig, with the paper's values.
-
-    References:
-        RTIP paper, Table IV.
-    """
+    """Position RMSE on the second paper's rig, beside Table IV of the RTIP paper."""
     # Stages of this rig have a prefix that the table does not need.
     ours = rmse(workspace, SECOND_PAPER).set_axis(list(LAWS))
     return _beside(ours, _table(SECOND_TABLE_4))
