@@ -101,7 +101,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
         progress.stage("write the model")
     info = model_info(found, recordings)
     save(found.model, arguments.out, info)
-    print(fit_lines(arguments.model, found))
+    print(fit_lines(arguments.model, found, found.usability))
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
     print(coefficient_table(found.model, plant.joint_names, plant.unit))
     if intervals := interval_table(found):
@@ -190,7 +190,7 @@ def _print(
     names = (*comparison.fits, *comparison.failed)
     print(f"models: {', '.join(f'{name}: {plain_name(name)}' for name in names)}\n")
     for name, fit in comparison.fits.items():
-        print(tables.fit_lines(name, fit, comparison.unfit().get(name, "")))
+        print(tables.fit_lines(name, fit, comparison.rating(name)))
     for name, why in comparison.failed.items():
         print(f"{name}: not fitted: {why}")
     if selection is not None:
@@ -218,7 +218,7 @@ def _conclusion(comparison: Comparison) -> str:
     from nfriction.evaluation.compare import NO_FRICTION
 
     best = comparison.best() or NO_FRICTION
-    if best == NO_FRICTION or comparison.fits[best].usability[0] == "do not use":
+    if best == NO_FRICTION or comparison.rating(best)[0] == "do not use":
         return ""
     error, unit = comparison.table()["all"], comparison.unit
     without, learnt = float(error[NO_FRICTION]), float(error[best])

@@ -1,6 +1,7 @@
 """`nfriction export` and `nfriction verify`: artefacts for controllers and simulators."""
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,8 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     info = replace(info, sample_time=arguments.sample_time or info.sample_time)
+    if info.rating and not info.rating.startswith("good"):
+        warnings.warn(f"{arguments.model.name} is rated {info.rating}.", stacklevel=1)
     check_writable(arguments.out)
     for target in arguments.format:
         if target in SIMULATORS:

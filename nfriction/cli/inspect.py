@@ -91,6 +91,8 @@ def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str
         yield "trained on", ", ".join(info.training_data)
     if "status" in info.fit:
         yield "fit", _fit(info.fit, info.unit)
+    if info.rating:
+        yield "rating", info.rating
 
 
 def _fit(fit: Mapping[str, object], unit: str) -> str:

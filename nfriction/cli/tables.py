@@ -43,9 +43,9 @@ def error_tables(comparison: Comparison) -> str:
     return "\n\n".join([*parts, LEGEND])
 
 
-def fit_lines(name: str, fit: FitResult, unfit: str = "") -> str:
-    """Usability, status and warnings of a fit; `unfit` is the reason if its test forbids use."""
-    verdict, reason = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
+def fit_lines(name: str, fit: FitResult, rating: tuple[str, str]) -> str:
+    """Rating, status and warnings of a fit."""
+    verdict, reason = rating
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     head = f"{verdict} ({reason})" if reason else verdict
     lines = [f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings]
@@ -90,7 +90,7 @@ def _best(comparison: Comparison, best: str) -> str:
     # Without a limit no difference can be called insignificant.
     if len(tied) < 2 or limit is None:
         return found
-    rated = {n: f" ({fit.usability[0]})" for n, fit in comparison.fits.items()}
+    rated = {n: f" ({comparison.rating(n)[0]})" for n in comparison.fits}
     others = ", ".join(f"{name}{rated.get(name, '')}" for name in tied if name != best)
     return (
         f"{found}\nstatistically tied with {others} (differences below the limit of these data, "

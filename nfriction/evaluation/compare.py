@@ -273,6 +273,11 @@ class Comparison:
             found.setdefault(str(name), "it predicts no better than a model that is not to be used")
         return found
 
+    def rating(self, name: str) -> tuple[str, str]:
+        """Usability of a fit and the reason; the test may forbid its use."""
+        unfit = self.unfit().get(name)
+        return ("do not use", f"in the test, {unfit}") if unfit else self.fits[name].usability
+
     def _parameters(self, name: str) -> int:
         found = self.fits.get(name)
         return sum(p.numel() for p in found.model.parameters()) if found else 0

@@ -149,6 +149,7 @@ def write_results(
             written = [TABLE]
             for name, fit in comparison.fits.items():
                 info = model_info(fit, train, run)
+                info = replace(info, fit={**info.fit, "usability": comparison.rating(name)})
                 paths = _write_model(fit, unfinished / "models" / f"{name}.json", info)
                 written += [f"models/{path.name}" for path in paths]
             write_index(unfinished, written)

@@ -102,7 +102,7 @@ def _words(contract: Contract, name: str) -> dict[str, str]:
     sample_time = description["sample_time"] or 1e-3
     return {
         "name": name,
-        "title": f"Friction of {description['joints']} joints",
+        "title": f"Friction of {description['joints']} joint" + "s" * (description["joints"] > 1),
         "unit": str(description["unit"]),
         "torque_unit": str(description["units"]["tau_f"]),
         "period": str(max(1, round(1e6 * sample_time))),

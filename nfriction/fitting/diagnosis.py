@@ -409,15 +409,17 @@ def _collect(
         since = stamps[at] - stamps[0]
         torque = recording.torque_at(stamps[at] + delay + drift * since)
         of = since[:, None], np.full((len(at), 1), k)
-        sd = sd_of_mean = 0 * torque
+        noise = noise_of_mean = 0 * torque
         if motion.std is not None:
-            sd = motion.std.qdd[at]
+            noise = motion.std.qdd[at]
             # A mean acceleration is a difference of velocities, too.
             over = max(1, block - 1) * recording.sample_time
-            sd_of_mean = np.minimum(sd, math.sqrt(2) / over * motion.std.qd[at])
-        parts.append((motion.q[at], motion.qd[at], motion.qdd[at], sd, sd_of_mean, torque, *of))
+            noise_of_mean = np.minimum(noise, math.sqrt(2) / over * motion.std.qd[at])
+        moved = motion.q[at], motion.qd[at], motion.qdd[at]
+        parts.append((*moved, noise, noise_of_mean, torque, *of))
     found = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    return _Data(*found, block)
+    q, qd, qdd, sd, sd_of_mean, tau, time, number = found
+    return _Data(q, qd, qdd, sd, sd_of_mean, tau, time, number, block)
 
 
 def _corrected_positions(
@@ -567,8 +569,9 @@ def _corrected_torques(
         without = replace(given, tau=given.tau - part)
         gain = _balance(without, without.tau - given.needed(plant), part)[1]
         if gain and abs(gain - 1) > options.gain_term[0]:
+            size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
             # Three digits, but 1000 and not 1e+03.
-            times = f"{float(f'{1 / gain:.3g}'):g} times too large"
+            times = f"{float(f'{size:.3g}'):g} times too {way}"
             wrong = f"is {times} (a unit, torque constant or gear ratio)"
             cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
             yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
@@ -714,23 +717,31 @@ def changing_friction(
     if len(data.q) < 2 * pieces * data.block:
         return
     time, number = data.mean(data.time), data.mean(data.number.to(data.time))
-    clocks = {"during a recording": time, "from the first recording to the last": number}
+    # At a constant rate, or as a warm-up of which 95 % is over at the end.
+    during = time, 1 - torch.exp(-3 * time / time.max())
+    clocks = {"during a recording": during, "from the first recording to the last": (number,)}
     for j in range(plant.joints):
         *means, sliding = _of_sliding(plant, data, j, options)
         terms = [x[sliding] for x in means]
         if (count := len(terms[0])) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
         piece = torch.arange(count) * pieces // count
-        for period, clock in clocks.items():
+        for period, shapes in clocks.items():
+            tried = []
             # Per time of sliding, in pieces that all contain some: rest shows nothing.
-            span = clock[sliding].max() - clock[sliding].min()
-            if span == 0:
+            for clock in (shape[sliding] for shape in shapes):
+                span = clock.max() - clock.min()
+                if span == 0:
+                    continue
+                given = [*terms, clock / span]
+                found = [_growth(piece == k, *given) for k in range(pieces)]
+                rates, squares = zip(*found, strict=True)
+                constant, growing = torch.stack(squares).T
+                tried.append((growing, constant, np.var(rates), _growth(piece < 0, *given)[0]))
+            if not tried:
                 continue
-            given = [*terms, clock[sliding] / span]
-            rate = _growth(piece < 0, *given)[0]
-            found = [_growth(piece == k, *given) for k in range(pieces)]
-            sd = math.sqrt((pieces - 1) * np.var([growth for growth, _ in found]))
-            constant, growing = torch.stack([squares for _, squares in found]).T
+            growing, constant, variance, rate = min(tried, key=lambda x: float(x[0].sum()))
+            sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
             if abs(rate) > least and gains(growing, constant, options.drift_chance):
@@ -948,8 +959,11 @@ def _of_noise(plant: Plant, data: _Data, sd: Tensor) -> float:
     """Share of the torque that its noise, and that of accelerations, explains [-]."""
     steps = data.tau.reshape(-1, data.block, plant.joints).diff(dim=1)
     white = steps.square().sum(1) / (2 * max(1, data.block - 1))
-    needed = data.mean(plant.mass_matrix(data.q).square() @ sd.square()[..., None])[..., 0]
-    return _share(plant, data, (data.moving * (white / data.block + needed)).mean(0))
+    variance, needed = white / data.block, data.needed(plant)
+    for own in torch.eye(plant.joints, dtype=sd.dtype):
+        moved = replace(data, qdd=data.qdd + own * sd).needed(plant)
+        variance = variance + data.mean((moved - needed).square())
+    return _share(plant, data, (data.moving * variance).mean(0))
 
 
 def _share(plant: Plant, data: _Data, target: Tensor) -> float:

@@ -152,8 +152,11 @@ class Sensitivity:
         blocks, rows, samples = cotangent.shape[:3]
         found = [cotangent.new_zeros(blocks, rows, 0)]
         for mix, features in self.factors():
+            constant = mix.stride(0) == features.stride(0) == 0  # over the samples
             mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
-            if features.shape[-1] == 1:
+            if constant and features.shape[-1] == 1:
+                both = cotangent.sum(2).transpose(1, 2) @ (mix * features[..., None])[0, 0]
+            elif features.shape[-1] == 1:
                 # No shared features: one product over samples and coefficients is faster.
                 by_parameter = (mix * features[..., None]).transpose(1, 2).flatten(2, 3)
                 both = cotangent.permute(0, 3, 1, 2, 4).flatten(3) @ by_parameter

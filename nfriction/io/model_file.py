@@ -74,6 +74,10 @@ class ModelInfo:
                     "`joint_names` must be texts, and `training_data` map names to digests, got "
                     f"{str(text)[:80]!r}."
                 )
+        rated = self.fit.get("usability", ("", ""))
+        pair = isinstance(rated, list | tuple) and len(rated) == 2
+        if not pair or not all(isinstance(text, str) for text in rated):
+            raise ValueError(f"a fit's `usability` must be two texts, got {str(rated)[:80]!r}.")
         for name, given in self.input_ranges.items():
             pairs = numbers(f"input_ranges[{name!r}]", given)
             sound = isinstance(pairs, list) and all(isinstance(p, list) for p in pairs)
@@ -82,6 +86,11 @@ class ModelInfo:
                     f"`input_ranges` of {name} must be [lowest, highest] for each joint, got "
                     f"{str(given)[:80]}."
                 )
+
+    @property
+    def rating(self) -> str:
+        """Usability of the fit with the reason, as "doubtful: ..."; empty if unknown."""
+        return ": ".join(text for text in self.fit.get("usability", ()) if text)
 
 
 def parameter_hash(state: Mapping[str, Tensor]) -> str:

@@ -79,7 +79,9 @@ class Recording:
         for key, value in (arrays | {"convention": convention, "names": names}).items():
             object.__setattr__(self, key, value)
         check(arrays, self.names, self.unit)
-        for finding, remedy in doubts(self.time, self.q, self.names, self.unit):
+        for finding, remedy in doubts(
+            self.time, self.q, self.names, self.unit, driven=self.tau is not None
+        ):
             self._warn(finding, remedy, stacklevel=4)
 
     @property

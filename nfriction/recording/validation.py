@@ -112,21 +112,30 @@ def _check_values(key: str, values: Array) -> None:
 
 
 def _check_stamps(time: Array) -> None:
-    stuck = np.flatnonzero(np.diff(time) <= 0)
-    if len(stuck):
-        k = int(stuck[0])
-        before, after = float(time[k]), float(time[k + 1])
+    steps = np.diff(time)
+    if (steps > 0).all():
+        return
+    # Steps back explain more than repeated stamps do.
+    k = int(np.argmax(steps < 0) if (steps < 0).any() else np.argmax(steps <= 0))
+    before, after = float(time[k]), float(time[k + 1])
+    if before > after:
         remedy = "sort the rows and drop repeated stamps"
-        if before == after and abs(after) >= LARGE_STAMP:
-            # The stamps of a clock have more digits than the logger wrote.
-            remedy = "write large stamps with more digits, or count from the recording's start"
-        raise ValueError(
-            f"`time` must increase, got {before!r} then {after!r} s at sample {k + 1} "
-            f"({len(stuck)} such steps); {remedy}."
-        )
+        if np.allclose(time[1:][steps < 0], time[0]):
+            remedy = "it starts anew, so read each recording of the file by itself"
+    elif abs(after) >= LARGE_STAMP:
+        # The stamps of a clock have more digits than the logger wrote.
+        remedy = "write large stamps with more digits, or count from the recording's start"
+    else:
+        remedy = "drop repeated rows; if their positions differ, write stamps with more digits"
+    raise ValueError(
+        f"`time` must increase, got {before!r} then {after!r} s at sample {k + 1} "
+        f"({(steps <= 0).sum()} such steps); {remedy}."
+    )
 
 
-def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[tuple[str, str]]:
+def doubts(
+    time: Array, q: Array, names: Sequence[str], unit: str, *, driven: bool
+) -> Iterator[tuple[str, str]]:
     """Signs that units or time stamps are wrong, each with its remedy."""
     step = np.diff(time)
     pauses = gaps(time)
@@ -158,11 +167,12 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> Iterator[t
         return
     # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and the first link of a
     # whirling chain seldom turns over. So if all joints exceed a full turn and one of them 30
-    # rad/s, they are driven wheels, or in degrees. Wrapped angles never span more than a turn.
+    # rad/s, they are in degrees, or driven wheels: recorded torques then show the unit of the
+    # angles. Wrapped angles never span more than a turn.
     turns = np.ptp(q, axis=0).min() / (2 * np.pi)
     with np.errstate(over="ignore"):  # stamps may be arbitrarily close
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
-    if turns > 1 and speed > 30.0 and not slow:
+    if turns > 1 and speed > 30.0 and not slow and not driven:
         yield (
             f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
             f"times, at up to {speed:.0f} rad/s)",

@@ -69,7 +69,7 @@ def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
     assert "next:" not in said
 
 
-def test_a_fit_that_is_not_to_be_used_is_not_told_to_be_exported(
+def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     time = 0.01 * np.arange(200)
@@ -82,6 +82,12 @@ def test_a_fit_that_is_not_to_be_used_is_not_told_to_be_exported(
     assert "do not use (a mistake in data or rig is likely" in said
     assert "gains energy" in said
     assert "next:" not in said
+    model, rating = str(tmp_path / "m.json"), "do not use: a mistake in data or rig is likely"
+    assert cli.main(["info", model]) == 0
+    assert f"rating:        {rating}" in capsys.readouterr().out
+    assert cli.main(["export", model, "--format", "c", "--out", str(tmp_path)]) == 0
+    assert f"m.json is rated {rating}" in capsys.readouterr().err
+    assert f"Rating of the fit: {rating}" in (tmp_path / "m.h").read_text()
 
 
 def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(

@@ -11,7 +11,9 @@ from nfriction import LFM, NFLFM, Recording, Rotor, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
 from nfriction.evaluation.compare import Comparison, Fits, coefficient_summary
 from nfriction.evaluation.parallel import Progress
+from nfriction.evaluation.results import write_results
 from nfriction.evaluation.score import RMSE, Errors, Score
+from nfriction.io.model_file import load_info
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import pendulum, swing
@@ -316,15 +318,19 @@ def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     assert scored(doubtful, 0.6, no_friction=5.0, NCFM=2.0, LFM=1.0).best() == "LFM"
 
 
-def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison):
+def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, tmp_path):
     found, _ = comparison
     assert scored(found, no_friction=5.0, NCFM=1.0, LFM=1.9).unfit() == {}
     runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
     assert set(runaway.unfit()) == {"LFM"}
     assert "not fit for use: LFM: NCFM with no more parameters has" in verdict(runaway)
-    line = fit_lines("LFM", runaway.fits["LFM"], runaway.unfit()["LFM"])
+    line = fit_lines("LFM", runaway.fits["LFM"], runaway.rating("LFM"))
     assert line.startswith("LFM: do not use (in the test, NCFM with no more parameters has")
     assert runaway.to_dict()["unfit"] == runaway.unfit()
+    write_results(runaway, [A], [B], tmp_path, figures=False)
+    # For whoever exports it later.
+    stated = load_info(tmp_path / "models" / "LFM.json").rating
+    assert stated.startswith("do not use: in the test, NCFM with no more parameters has")
     assert "it diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
     worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()
     assert worse == dict.fromkeys(("NCFM", "LFM"), "no friction predicts better")

@@ -136,7 +136,6 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
     assert not any("delay" in text for text in held.warnings)
 
 
-@pytest.mark.filterwarnings("ignore:.*looks like degrees")
 @pytest.mark.parametrize(
     ("motion", "verdict"),
     # The last one needs more steps of the integration at the start of the search than at its end.

@@ -188,20 +188,24 @@ def test_a_friction_that_changes_within_a_recording_is_named(change):
     assert abs(float(found) - 100 * abs(end / start - 1)) < float(within) + 1 < 20
 
 
-@pytest.mark.parametrize("fall", [0.0, 0.2])
-def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall):
+@pytest.mark.parametrize(("fall", "constants"), [(0.0, 1), (0.2, 0.01), (0.2, 4)])
+def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
+    """As a warm-up over some of its time constants."""
     rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
     phase, rng = rate * time, np.random.default_rng(0)
     q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)
     q, qd, qdd = (x.sum(1, keepdims=True) for x in (q, qd, qdd))
-    tau = 3.5 * qdd + (1 - fall * time / time[-1]) * (12 * np.sign(qd) + 15 * qd)
+    warm = np.expm1(-constants * time / time[-1]) / np.expm1(-constants)
+    tau = 3.5 * qdd + (1 - fall * warm) * (12 * np.sign(qd) + 15 * qd)
     q += 1e-5 * rng.normal(size=q.shape)
     tau += 0.1 * rng.normal(size=q.shape)
     recording = Recording(time[:, 0], q, tau, unit="m")
     motions = [kalman_smoother(recording.time, recording.q)]
     said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
     assert len(said) == (fall > 0)
-    assert all("falls by 20 % (within" in sentence for sentence in said)
+    for sentence in said:
+        found, within = re.search(r"falls by (\S+) % \(within (\S+) %\)", sentence).groups()
+        assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
 @pytest.mark.parametrize("chirp", [True, False])
@@ -773,6 +777,14 @@ def test_a_step_at_a_gap_is_no_spike():
     kept = np.r_[0:1000, 1600 : len(q)]
     with pytest.warns(UserWarning, match="gaps"):
         found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
+    assert not any("jumps" in warning for warning in found)
+
+
+def test_time_stamps_that_jitter_are_no_jump():
+    """Samples are taken on time, and stamped late; scaled by the stamps, fast steps differ."""
+    plant, q, tau = measured("wheel", count=COUNT / 50)
+    late = np.abs(np.random.default_rng(0).normal(scale=0.1 * STEP, size=len(q)))
+    found = warnings_of(plant, q, tau, time=STEP * np.arange(len(q)) + late)
     assert not any("jumps" in warning for warning in found)
 
 

@@ -1,13 +1,15 @@
 """Geared mechanisms that torques drive, read at irregular times, and what a law expects of them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
+from nfriction import LFM, NLFM, Motor, PendulumChain, Recording, Rotor, fit, rollout
 from nfriction.evaluation.cross_validation import block_errors, blocked_k_fold
+from nfriction.fitting.result.of_search import rotor_warning
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CFM, CVFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFCVFM
@@ -271,3 +273,12 @@ def test_a_rotor_inertia_that_the_rig_lacks_is_named_where_it_bends_other_terms(
     recording = driven(truth, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
     found = fit(CVFM(2, v_smooth=V_SMOOTH), given, recording, windows=(0.5,), max_steps=20)
     assert any("has no rotor inertia" in text for text in found.warnings) == bare
+
+
+@pytest.mark.parametrize("motor", [None, Motor(50), Motor(50, rotor_inertia=1.2e-5)])
+def test_the_rotor_of_a_wheels_motor_counts_as_one(motor):
+    """A `Rotor` adds it to its single inertia."""
+    jacobian = SimpleNamespace(plant=Rotor(0.02, motor=motor))
+    problem = SimpleNamespace(windows=SimpleNamespace(tau=torch.ones(1)), jacobian=jacobian)
+    has_rotor = motor is not None and bool(motor.rotor_inertia)
+    assert (rotor_warning(problem, (), ("inertia 11",)) == ()) == has_rotor

@@ -191,6 +191,18 @@ def test_an_asymmetric_axis_is_told_from_its_offset():
     assert not any("constant drive" in w for w in found.warnings)
 
 
+def test_a_weight_on_an_axis_is_no_asymmetry_of_its_friction():
+    """Its drive carries the weight, which the rig lacks."""
+    axis = LinearAxis(2.0)
+    level = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
+    recording = replace(level, tau=level.tau + 20.0)
+    found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
+    assert float(found.plant.torque_offset) == pytest.approx(-20.0, rel=0.01)
+    (told,) = (w for w in found.warnings if "constant drive force" in w)
+    assert "is larger than its friction: a weight, a spring, or a sensor's bias" in told
+    assert "larger forwards" not in told
+
+
 def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
     recording = swing(pendulum(), true_model(), seconds=1.0)
 

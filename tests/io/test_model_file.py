@@ -367,6 +367,7 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "no range": (lambda c: c["input_ranges"].update(qd=None), "must be numbers"),
     "names no texts": (lambda c: c.update(joint_names=["a", 2]), "must be texts"),
     "too few names": (lambda c: c.update(joint_names=["a"]), "must be 2 texts"),
+    "rating no text": (lambda c: c["fit"].update(usability=1), "`usability` must be two texts"),
     "digest no text": (lambda c: c["training_data"].update(run=1), "map names to digests"),
     "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "not an array|got shape"),
     "extra": (

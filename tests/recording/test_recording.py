@@ -367,9 +367,10 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
         ({"qd": np.zeros((59, 2))}, "`qd` must be shaped like"),
         ({"time": np.arange(59.0)}, "as many samples"),
         ({"time": poked((60,), (0,), np.nan)}, "`time` must be finite"),
-        ({"time": np.repeat(np.arange(30.0), 2)}, r"`time` must increase.*sample 1 \(30 such"),
+        ({"time": np.repeat(np.arange(30.0), 2)}, r"sample 1 \(30 such.*drop repeated rows; if"),
         ({"time": -np.arange(60.0)}, "`time` must increase"),
-        ({"time": poked((60,), (1,), 0.5)}, r"got 0\.5 then 0\.0 s at sample 2 .*sort the rows"),
+        ({"time": np.r_[0.0:30, 28:58]}, r"got 29\.0 then 28\.0 s at sample 30 .*sort the rows"),
+        ({"time": np.r_[0.0:30, 0:30]}, r"got 29\.0 then 0\.0 s .*read each recording of the file"),
         (
             {"time": 1.7e9 + np.repeat(np.arange(30.0), 2)},
             r"got 1700000000\.0 then 1700000000\.0 s .*with more digits, or count from",
@@ -802,3 +803,14 @@ def test_positions_in_whole_degrees_or_counts_are_refused(size):
         Recording(time, q)
     assert Recording(time, q, unit="m").unit == "m"
     assert Recording(time, np.ones_like(q)).joints == 1
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_fast_turning_is_doubted_only_without_torques(driven: bool) -> None:
+    """With torques, their balance shows whether a fast motion is one of a wheel or in degrees."""
+    time = np.linspace(0.0, 1.0, 60)
+    q, tau = 50.0 * time[:, None], np.ones((60, 1)) if driven else None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Recording(time, q, tau)
+    assert any("looks like degrees" in str(w.message) for w in caught) != driven

@@ -1,5 +1,8 @@
 /*
- * {{ safe(about.model) }}: friction of {{ joints }} joints, made by nfriction {{ safe(about.version) }} (schema {{ about.schema }}).
+ * {{ safe(about.model) }}: friction of {{ joints }} joint{{ "s" if joints > 1 }}, made by nfriction {{ safe(about.version) }} (schema {{ about.schema }}).
+{% if about.fit.usability %}
+ * Rating of the fit: {{ safe(about.fit.usability | select | join(": ")) }}.
+{% endif %}
  *
  * Inputs: qd [{{ safe(about.units.qd) }}], qdd [{{ safe(about.units.qdd) }}], load [{{ safe(about.units.load) }}].
  * Outputs: tau [{{ safe(about.units.tau_f) }}], on the left side of M(q) qdd + bias(q, qd) + tau = drive; coefficients:

@@ -348,8 +348,9 @@ def integration_substeps(
     needed, most = required_substeps(plant, model, longest_step), options.max_substeps
     if needed > most:
         logger.warning(
-            "near rest a sample needs %d integration steps, fits take %d; use v_smooth >= %.2g "
-            "(now %.2g), or a higher sample rate (a fit of a model by name chooses v_smooth)",
+            "near rest a sample needs %d integration steps, fits take %d, so motion near rest is "
+            "approximate; a higher sample rate avoids this, or a model with v_smooth >= %.2g "
+            "(now %.2g)",
             needed, most, model.v_smooth * needed / most, model.v_smooth,
         )  # fmt: skip
     # Twice the present need, because coefficients may grow during the search.
@@ -475,13 +476,15 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        # Steps, scaled to equal length, far above both adjacent steps, which are similar; across a
-        # gap any step is possible.
-        step = np.diff(q, axis=0) * (recording.sample_time / np.diff(time))[:, None]
-        step[gaps(time)] = np.nan
-        before, at, after = step[:-2], step[1:-1], step[2:]
-        height = np.minimum(np.abs(at - before), np.abs(at - after))
-        height = np.where(2 * np.abs(after - before) <= height, height, 0.0)
+        # Steps far above both adjacent steps, which are similar; across a gap any step is possible.
+        steps, heights = np.diff(q, axis=0), []
+        steps[gaps(time)] = np.nan
+        # Also if scaled to equal length: either the samples or their time stamps may jitter.
+        for step in (steps, steps * (recording.sample_time / np.diff(time))[:, None]):
+            before, at, after = step[:-2], step[1:-1], step[2:]
+            high = np.minimum(np.abs(at - before), np.abs(at - after))
+            heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
+        height = np.minimum(*heights)
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
         for name, peak, jump, high in zip(recording.names, far.T, lasting.T, height.T, strict=True):
             of = f"{recording.name or 'A recording'}: {name} jumps"

@@ -21,6 +21,7 @@ from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
+from nfriction.recording.validation import gaps
 from nfriction.signals import Motion
 
 if TYPE_CHECKING:
@@ -233,10 +234,9 @@ class FitResult:
             return []
         total: Tensor | float = 0.0
         for motion in self.motions:
-            # No sample extends over a gap.
-            step = np.gradient(motion.time)
-            step = torch.as_tensor(np.where(step > 10 * np.median(step), 0.0, step))
-            total = total + rules.seconds(step, *map(torch.as_tensor, (motion.qd, motion.qdd)))
+            step = np.diff(motion.time, append=motion.time[-1])
+            step[gaps(motion.time)] = 0.0
+            total = total + rules.seconds(*map(torch.as_tensor, (step, motion.qd, motion.qdd)))
         return [] if isinstance(total, float) else total.tolist()
 
     def to_dict(self) -> dict[str, Any]:

@@ -143,7 +143,7 @@ def result_from_shooting(
         )
         + scale_warning(problem, intervals)
         + rotor_warning(problem, at_bounds, at_most)
-        + tuple(offset_warnings(problem, vector, intervals))
+        + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
         outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
@@ -191,8 +191,11 @@ def rotor_warning(
     problem: ShootingProblem, at_bounds: Sequence[str], at_most: Sequence[str]
 ) -> tuple[str, ...]:
     """A sentence if a driven chain without rotors has a length or largest inertia at a bound."""
-    tau, own = problem.windows.tau, dict(problem.jacobian.plant.named_buffers())
-    bare = tau.any() and not own.get("armature", tau).any()
+    tau, plant = problem.windows.tau, problem.jacobian.plant
+    rotors = dict(plant.named_buffers()).get("armature", tau)
+    if plant.motor is not None:
+        rotors = rotors + plant.motor.reflected_inertia(plant.joints)
+    bare = tau.any() and not rotors.any()
     largest = any(name.startswith("inertia") for name in at_most)
     hit = largest or any(name.startswith("length") for name in at_bounds)
     said = "The rig has no rotor inertia (`armature`, or that of a `motor`). With geared drives, "
@@ -200,10 +203,16 @@ def rotor_warning(
 
 
 def offset_warnings(
-    problem: ShootingProblem, vector: Tensor, intervals: Sequence[Interval]
+    problem: ShootingProblem,
+    vector: Tensor,
+    intervals: Sequence[Interval],
+    model: FrictionModel,
+    motions: Sequence[Motion],
 ) -> Iterator[str]:
     """A sentence for each drive with a larger one-way torque than a sensor's usual bias."""
     plant, slides = problem.plant_at(vector), problem.jacobian.plant.unit == "m"
+    # Friction brakes in both directions, so it differs between them by at most twice its mean.
+    largest = _largest_friction(model, plant, motions)
     # Within its prior an offset is a bias like any other; so is what is as small at full speed.
     usual = problem.options.offset_term[1] / problem.options.asymmetry_term[1]
     kinds = {"torque_offset", "asymmetry"}
@@ -217,11 +226,23 @@ def offset_warnings(
             kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")
             unit = ("N" if slides else "N m") if constant else "N s/m times the speed"
             way = "backwards" if whole > 0 else "forwards"
+            cause = f"may equally be friction that is {2 * abs(whole):.3g} {unit} larger {way}"
+            if constant and abs(whole) > largest[j]:
+                cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
             yield (
                 f"The fitted plant has a {kind} of {whole:.3g} {unit} at {plant.joint_names[j]}, "
-                f"which may equally be friction that is {2 * abs(whole):.3g} {unit} larger {way}. "
-                f"The friction model and its exports lack it: add {-whole:.3g} {unit} to a command."
+                f"which {cause}. The friction model and its exports lack it: add {-whole:.3g} "
+                f"{unit} to a command."
             )
+
+
+def _largest_friction(model: FrictionModel, plant: Plant, motions: Sequence[Motion]) -> Tensor:
+    """Largest friction torque of each joint in a motion, (joint,); infinite with a memory."""
+    if model.law.memory or model.schedule.state_size:
+        return torch.full((plant.joints,), torch.inf)
+    parts = ([getattr(m, key) for m in motions] for key in ("q", "qd", "qdd"))
+    q, qd, qdd = (torch.tensor(np.concatenate(x)) for x in parts)
+    return model(qd, qdd, plant.load(q, qd)).abs().amax(0)
 
 
 def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:

@@ -39,6 +39,12 @@ def scaled_rows(
         yield part, scaled.flatten(1, 2)
 
 
+def gram(rows: Tensor) -> Tensor:
+    """Products of all pairs of columns; NumPy, unlike torch, computes each pair once."""
+    columns = rows.numpy()
+    return torch.from_numpy(columns.T @ columns)
+
+
 def normal_equations(
     rows: Iterable[Rows], r: Tensor, indices: Tensor, size: int
 ) -> tuple[Tensor, Tensor]:
@@ -54,7 +60,7 @@ def normal_equations(
         common, own = scaled.split([shared, count], -1)
         errors, flat = r[:, part].flatten(1), common.flatten(0, 1)
         gradient[:shared] += errors.flatten() @ flat
-        hessian[:shared, :shared] += flat.T @ flat
+        hessian[:shared, :shared] += gram(flat)
         slope += (errors[:, None] @ own)[:, 0]
         mixed += own.mT @ common
         curvature += own.mT @ own
@@ -91,8 +97,7 @@ class Kept:
     def squares(self, rows: Tensor) -> Tensor:
         """J^T J of rows (window, row, column) without states, (kept, kept)."""
         if self.shared == rows.shape[-1]:
-            flat = rows.flatten(0, 1)
-            return flat.T @ flat
+            return gram(rows.flatten(0, 1))
         total = torch.zeros(self.count, self.count, dtype=torch.float64)
         at = self._places()
         return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)
