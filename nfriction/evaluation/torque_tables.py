@@ -308,6 +308,14 @@ def fit_torque(
         raise ValueError(f"`folds` must be at least 2, got {folds}.")
     # One velocity for all joints, as a model file has one.
     v_smooth = torque_table.turning_velocity(given)
+    remarks = list(given.remarks)
+    for one in given.joints:
+        if resting := len(one) - len(one.sliding(v_smooth)):
+            remarks.append(
+                f"{one.name} rests in {resting} of {len(one)} rows, which are left out: there "
+                "dry friction can have any value."
+            )
+    given = replace(given, joints=tuple(one.sliding(v_smooth) for one in given.joints))
     fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
     failed: dict[str, str] = {}
@@ -326,7 +334,6 @@ def fit_torque(
     if not fits:
         raise ValueError(" ".join(failed.values()))
     choices = {}
-    remarks = list(given.remarks)
     for k, (joint, of) in enumerate(errors.items()):
         shown = _shown(given.joints[k], of)
         name, why = _choose(shown)
@@ -339,7 +346,7 @@ def fit_torque(
 
 
 def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str]:
-    """Rows far off the chosen law, and an error that follows the velocity, a sentence each.
+    """Rows far off the chosen law, or an error that follows the velocity or load, a sentence each.
 
     Only for rows in no order: along a motion, errors follow reversals and what precedes them.
     """
@@ -349,13 +356,21 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
     if joint.time is not None or len(rows) < MINIMUM_ROWS:
         return
     rows, small = rows[np.argsort(joint.qd[rows])], SMALL * float(np.median(np.abs(joint.tau)))
-    own, left = f"{plain_name(type(model).__name__)} at {joint.name}", error[rows]
-    left = left - left.mean()
+    share = max(0.5, 3 / math.sqrt(len(rows)))
+    own = f"{plain_name(type(model).__name__)} at {joint.name}"
+    left = error[rows] - error[rows].mean()
+    common, quantity = float(left[1:] @ left[:-1]), "velocity"
+    if joint.load is not None:
+        # A law of the load may lack a constant friction, so velocity and load matter together.
+        speed, load = np.abs(joint.qd[rows]), joint.load[rows]
+        terms = np.sign(joint.qd[rows])[:, None] * np.stack([speed**0, speed, load], -1)
+        explained = terms @ np.linalg.lstsq(terms, left, rcond=None)[0]
+        if float(explained @ explained) > common:
+            common, quantity = float(explained @ explained), "velocity and the load"
     # If neighbours share more than half of the error, it is no chance and no single mistake.
-    common = max(0.5, 3 / math.sqrt(len(left))) * float(left @ left)
-    if float(left @ left) > len(left) * small**2 and float(left[1:] @ left[:-1]) > common:
+    if float(left @ left) > len(left) * small**2 and common > share * float(left @ left):
         yield (
-            f"Most of the error of {own} follows the velocity: the law has another shape, which "
+            f"Most of the error of {own} follows the {quantity}: the law has another shape, which "
             "the intervals do not cover. Add neuro-fuzzy models, or a law of your own."
         )
         return
@@ -483,9 +498,10 @@ def _fit(
 def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     """Error of the torque that a model of one joint predicts at the rows of a joint.
 
-    The lead-in of a law with memory is not scored, because the model was given its torque. A ripple
-    that is out of phase with the rows is logged.
+    Rows at rest are not scored if they are in no order, nor is the lead-in of a law with memory,
+    because the model was given its torque. A ripple that is out of phase with the rows is logged.
     """
+    joint = joint.sliding(model.v_smooth)
     torque, rows = torque_table.predict(model, joint).numpy(), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # The initial deflection was estimated from the torque of these rows.

@@ -87,6 +87,11 @@ class JointTorque:
         some: dict[str, Any] = {k: None if x is None else x[index] for k, x in every.items()}
         return replace(self, **some)
 
+    def sliding(self, speed: float) -> JointTorque:
+        """Unordered rows faster than this; at rest dry friction can have any value."""
+        fast = np.abs(self.qd) > speed
+        return self if self.time is not None or fast.all() or not fast.any() else self.rows(fast)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TorqueTable:

@@ -225,6 +225,30 @@ def test_rows_far_off_and_a_shape_that_no_law_has_are_remarked(sd: float) -> Non
     assert "follows the velocity" in remark
 
 
+def test_a_constant_friction_beside_that_of_the_load_is_remarked() -> None:
+    rng = np.random.default_rng(0)
+    load, qd = rng.uniform(0, 2, 60), rng.choice([-1, 1], 60) * rng.uniform(0.3, 8, 60)
+    noise = 0.002 * rng.normal(size=60)
+    for constant in (0.0, 0.05):
+        tau = (constant + 0.08 * load) * np.sign(qd) + 0.02 * qd + noise
+        remarks = fit_torque(pd.DataFrame({"qd": qd, "tau": tau, "load": load})).table.remarks
+        assert len(remarks) == (constant > 0)
+        assert all("follows the velocity and the load" in remark for remark in remarks)
+
+
+def test_rows_at_rest_are_left_out() -> None:
+    rng = np.random.default_rng(0)
+    qd = np.r_[np.zeros(200), np.repeat([-4, -2, -1, -0.5, 0.5, 1, 2, 4], 10)]
+    sliding = 0.1 * np.sign(qd) + 0.02 * qd + 0.002 * rng.normal(size=280)
+    table = pd.DataFrame({"qd": qd, "tau": np.where(qd, sliding, rng.uniform(-0.1, 0.1, 280))})
+    found = fit_torque(table, "coulomb-viscous")
+    assert "joint1 rests in 200 of 280 rows, which are left out" in found.table.remarks[0]
+    dry, viscous = found.fits["CVFM"][0].intervals
+    assert dry.low < 0.1 < dry.high < dry.low + 0.01
+    assert viscous.low < 0.02 < viscous.high < viscous.low + 0.002
+    assert float(found.score(table).rmse.iloc[0]) < 0.003
+
+
 def test_summary_and_notebook_show_choice_and_intervals() -> None:
     found = fit_torque(stribeck_table(), "coulomb-viscous,stribeck")
     for text in (repr(found), found.summary(), found._repr_html_()):
