@@ -56,7 +56,8 @@ def interval_table(fit: FitResult) -> str:
     """Values and 95 % intervals of constant coefficients and the plant's terms; empty of others."""
     names = fit.names_with_si()
     rows = [(names.get(i.name, i.name), i.value, i.low, i.high) for i in fit.intervals]
-    table = tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms))
+    name, plant = type(fit.model).__name__, bool(fit.plant_terms)
+    table = tables.interval_table(name, rows, plant, fit.warnings)
     return str(table) if rows else ""
 
 

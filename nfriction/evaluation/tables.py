@@ -171,10 +171,18 @@ def coefficient_table(
 
 
 def interval_table(
-    model: str, intervals: Sequence[tuple[str, float, float, float]], plant: bool
+    model: str,
+    intervals: Sequence[tuple[str, float, float, float]],
+    plant: bool,
+    warnings: Sequence[str],
 ) -> Table:
-    """95 % confidence intervals of a model: parameter, value, ends; `plant` for its terms too."""
+    """95 % confidence intervals of a model: parameter, value, ends; `plant` for its terms too.
+
+    The caption mentions warnings of errors that the intervals do not cover.
+    """
     caption = f"95 % confidence intervals of {model}"
+    if any("intervals do not cover this" in warning for warning in warnings):
+        caption += ", assuming a complete model"
     if plant:
         caption += " (plant terms as relative change from the rig, offsets in SI)"
     return Table(caption, ("parameter", "value", "from", "to"), tuple(intervals))

@@ -406,6 +406,8 @@ def coefficient_scale(
             columns.append(torch.zeros_like(rms))
         elif c.unit.endswith("s/rad"):
             columns.append(torque / rms / 3)
+        elif c.unit == "-":
+            columns.append(torch.full_like(rms, 1 / 3))
         else:
             columns.append(torque / 3)
     return torch.stack(columns, -1)

@@ -12,8 +12,9 @@ from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 
 # A coefficient for each input, behind the law's own.
 INPUTS = {
-    # Friction that is larger in one direction than in the other; it vanishes at rest.
-    "direction": Coefficient("F_t", "N m", positive=False, prior_scale=1.0),
+    # Relative to the friction, so that it brakes in both directions and vanishes at rest; a
+    # constant torque would be the offset of a drive.
+    "direction": Coefficient("d", "-", positive=False, prior_scale=1.0),
     "load": Coefficient("F_n", "N m", prior_scale=1.0),
     # Replaces the load; it is periodic, between 0 and 1.
     "position": Coefficient("F_p", "N m", prior_scale=1.0),
@@ -25,9 +26,9 @@ INPUTS = {
 def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
     """A law with further inputs.
 
-    Direction gives `f + F_t sgn(qd)^2`, load `f + F_n load sgn(qd)`; so does position, with a plant
-    whose load is `(1 + cos(k q + p)) / 2` (`Plant.load`); heat multiplies the result by
-    `exp(-k_h h)`, with h a hidden state of the coefficients (`nfriction.friction.heat`).
+    Load gives `f + F_n load sgn(qd)`; so does position, with a plant whose load is
+    `(1 + cos(k q + p)) / 2` (`Plant.load`); direction multiplies the result by `1 + d sgn(qd)`, and
+    heat by `exp(-k_h h)`, with h a hidden state of the coefficients (`nfriction.friction.heat`).
 
     Raises:
         ValueError: for an input that does not exist or is repeated; for load with position, or one
@@ -74,10 +75,10 @@ class _WithInputs(nn.Module):
     def forward(self, qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
         tau_f = self.torque(qd, load, coefficients[..., : self.own], v_smooth)
         sign = torch.tanh(qd / v_smooth)
-        if self.turns:
-            tau_f = tau_f + coefficients.select(-1, self.own) * sign * sign
         if self.loaded:
             tau_f = tau_f + coefficients.select(-1, self.own + int(self.turns)) * load * sign
+        if self.turns:
+            tau_f = tau_f * (1.0 + coefficients.select(-1, self.own) * sign)
         if self.heated:
             tau_f = tau_f * torch.exp(-coefficients.select(-1, -2) * coefficients.select(-1, -1))
         return tau_f

@@ -293,7 +293,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for what, (low, high) in fit.intervals.items()
     ]
     if intervals:
-        shown.append(tables.interval_table(name, intervals, bool(fit.plant)))
+        shown.append(tables.interval_table(name, intervals, bool(fit.plant), fit.warnings))
     unfit = run.unfit.get(name)
     verdict, why = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
     return {

@@ -3,6 +3,7 @@
 import argparse
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -303,6 +304,9 @@ def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
         intervals=tuple(Interval(n, 0.0, -0.1, 0.1) for n in ("F_c of joint1", *changes)),
     )  # fmt: skip
     said = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
+    assert "complete" not in interval_table(fit)
+    doubted = replace(fit, warnings=("The intervals do not cover this.",))
+    assert "of CVFM, assuming a complete model (plant" in interval_table(doubted)
     inertia, moment = float(plant.inertia_coupling[1, 1]), float(plant.gravity_moment[1])
     assert said == [
         "F_c of joint1",

@@ -39,14 +39,14 @@ from nfriction.friction.laws import COULOMB_VISCOUS, LINEAR
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.optim.least_squares import Quadratic
-from nfriction.signals import Motion
+from nfriction.signals import Motion, quantise
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
 BRIEF = {"windows": (0.5,), "fit_plant": False, "drag": False}
 TRUTHS = {
     "nothing": ([], [[5e-3, 1e-3], [2e-3, 5e-4]]),
-    "direction": (["direction"], [[5e-3, 1e-3, 2e-3], [2e-3, 5e-4, -1e-3]]),
+    "direction": (["direction"], [[5e-3, 1e-3, 0.4], [2e-3, 5e-4, -0.5]]),
     "load": (["load"], [[1e-3, 1e-3, 4e-3], [5e-4, 5e-4, 2e-3]]),
     "position": (["position"], [[4e-3, 1e-3, 3e-3], [1e-3, 5e-4, 2e-3]]),
     "heat": (["heat"], [[5e-3, 1e-3, 1.5, 0.0], [2e-3, 5e-4, 1.0, 0.0]]),
@@ -95,6 +95,34 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         torch.testing.assert_close(refitted.plant.load_waves, WAVES)
         off = (refitted.plant.load_phase - PHASES + math.pi) % (2 * math.pi) - math.pi
         assert off.abs().max() < 0.1
+
+
+def test_dry_and_viscous_friction_differ_by_direction_in_their_own_ratios() -> None:
+    """The constant torque of a drive explains only the dry part."""
+    time, step, inertia = 2e-3 * np.arange(2001), 2e-4, 0.08
+    tau, q, v, turned = 3.0 * np.sin(4 * time) + 1.5 * np.sin(11 * time), 0.0, 0.0, []
+    for torque in tau:
+        turned.append(q)
+        for _ in range(10):
+            free = v + step / inertia * torque
+            dry, viscous = (1.0, 0.5) if free > 0 else (0.7, 0.3)
+            slowed = max(0.0, abs(free) - step / inertia * dry) / (1 + step / inertia * viscous)
+            v = math.copysign(slowed, free)
+            q += step * v
+    recording = Recording(time, quantise(np.array(turned)[:, None], 65536), tau=tau[:, None])
+    brief, plant = {"windows": (0.5,)}, Rotor(inertia)
+    law = fit("coulomb-viscous", plant, recording, **brief)
+    task = prepare_task(
+        NFCVFM(1, v_smooth=law.model.v_smooth), plant, [recording], FitOptions(**brief)
+    )
+    (found, *_), refitted, _ = chosen_inputs(task, law)
+    assert found.name == "direction"
+    assert refitted.residual < 0.2 * law.residual
+    dry, viscous, share = refitted.model.schedule.values[0].tolist()
+    assert (viscous * (1 + share), viscous * (1 - share)) == pytest.approx((0.5, 0.3), rel=0.03)
+    offset = float(refitted.plant.torque_offset)
+    assert dry * (1 + share) - offset == pytest.approx(1.0, rel=0.03)
+    assert dry * (1 - share) + offset == pytest.approx(0.7, rel=0.03)
 
 
 def test_the_fall_by_heat_is_recovered() -> None:
@@ -281,8 +309,7 @@ def test_window_states_are_at_their_best() -> None:
 
 @pytest.mark.parametrize(
     ("viscous", "by_direction", "driving"),
-    # The last drives at low speed alone, as a law does whose shape is off.
-    [(1e-4, 2e-3, False), (1e-4, -9e-3, True), (1e-3, -6e-3, False)],
+    [(1e-4, 0.4, False), (1e-4, -1.8, True), (1e-3, -0.9, False)],
 )
 def test_a_constant_torque_is_no_friction_by_direction(viscous, by_direction, driving) -> None:
     law = with_inputs(COULOMB_VISCOUS, ["direction"])

@@ -123,7 +123,7 @@ def test_a_simulation_heats_alike_at_any_sample_time() -> None:
 
 def test_friction_that_drives_does_not_cool() -> None:
     law = with_inputs(COULOMB_VISCOUS, ["direction", "heat"])
-    schedule = HeatedConstant(law, 1, [0.02, 0.0, 0.3, 0.5, 0.0])
+    schedule = HeatedConstant(law, 1, [0.02, 0.0, 2.0, 0.5, 0.0])
     schedule.set_heat(0.01, 1.0, STEP)
     backwards = -torch.ones(400, 1, dtype=F64)
     assert not schedule.states(backwards, 0 * backwards).any()

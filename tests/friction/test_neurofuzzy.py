@@ -374,9 +374,8 @@ def test_inputs_add_terms_that_leave_the_law_as_it_was() -> None:
     model = NFCVFM(2, [0.1, 0.2, 0.03, 0.04], inputs=["direction", "load"])
     qd, qdd = torch.tensor([[-2.0, 3.0]]).double(), torch.zeros(1, 2).double()
     load = torch.tensor([[0.5, 1.5]]).double()
-    added = model(qd, qdd, load) - plain(qd, qdd, load)
-    expected = 0.03 + 0.04 * load * qd.sign()
-    torch.testing.assert_close(added, expected, rtol=1e-6, atol=1e-9)
+    expected = (plain(qd, qdd, load) + 0.04 * load * qd.sign()) * (1 + 0.03 * qd.sign())
+    torch.testing.assert_close(model(qd, qdd, load), expected, rtol=1e-6, atol=1e-9)
     assert not model(0 * qd, qdd, load).any()
     copied = pickle.loads(pickle.dumps(model))
     assert copied.law == copy.deepcopy(model).law == model.law
