@@ -1,6 +1,6 @@
 /*
  * {{ safe(about.model) }}: friction of {{ joints }} joint{{ "s" if joints > 1 }}, made by nfriction {{ safe(about.version) }} (schema {{ about.schema }}).
-{% if about.fit.usability %}
+{% if about.fit.get("usability") %}
  * Rating of the fit: {{ safe(about.fit.usability | select | join(": ")) }}.
 {% endif %}
  *

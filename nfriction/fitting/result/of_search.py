@@ -237,8 +237,11 @@ def offset_warnings(
 
 
 def _largest_friction(model: FrictionModel, plant: Plant, motions: Sequence[Motion]) -> Tensor:
-    """Largest friction torque of each joint in a motion, (joint,); infinite with a memory."""
-    if model.law.memory or model.schedule.state_size:
+    """Largest friction torque of each joint in the motions, (joint,).
+
+    Infinite where it is unknown: with a memory, or without motions.
+    """
+    if model.law.memory or model.schedule.state_size or not motions:
         return torch.full((plant.joints,), torch.inf)
     parts = ([getattr(m, key) for m in motions] for key in ("q", "qd", "qdd"))
     q, qd, qdd = (torch.tensor(np.concatenate(x)) for x in parts)
