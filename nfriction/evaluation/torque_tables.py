@@ -310,12 +310,12 @@ def fit_torque(
     v_smooth = torque_table.turning_velocity(given)
     remarks = list(given.remarks)
     for one in given.joints:
-        if resting := len(one) - len(one.sliding(v_smooth)):
+        if resting := len(one) - len(one.sliding):
             remarks.append(
                 f"{one.name} rests in {resting} of {len(one)} rows, which are left out: there "
                 "dry friction can have any value."
             )
-    given = replace(given, joints=tuple(one.sliding(v_smooth) for one in given.joints))
+    given = replace(given, joints=tuple(one.sliding for one in given.joints))
     fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
     failed: dict[str, str] = {}
@@ -332,7 +332,7 @@ def fit_torque(
         for joint, (_, candidate) in zip(given.joint_names, found, strict=True):
             errors[joint].append(candidate)
     if not fits:
-        raise ValueError(" ".join(failed.values()))
+        raise ValueError(" ".join([*remarks, *failed.values()]))
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):
         shown = _shown(given.joints[k], of)
@@ -369,9 +369,11 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
             common, quantity = float(explained @ explained), "velocity and the load"
     # If neighbours share more than half of the error, it is no chance and no single mistake.
     if float(left @ left) > len(left) * small**2 and common > share * float(left @ left):
+        lacks_load = quantity != "velocity" and not torque_table.reads_load(model)
+        better = "a law of the load (load-coulomb)" if lacks_load else "neuro-fuzzy models"
         yield (
             f"Most of the error of {own} follows the {quantity}: the law has another shape, which "
-            "the intervals do not cover. Add neuro-fuzzy models, or a law of your own."
+            f"the intervals do not cover. Add {better}, or a law of your own."
         )
         return
     low, high = np.quantile(left, (0.25, 0.75))
@@ -501,7 +503,7 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     Rows at rest are not scored if they are in no order, nor is the lead-in of a law with memory,
     because the model was given its torque. A ripple that is out of phase with the rows is logged.
     """
-    joint = joint.sliding(model.v_smooth)
+    joint = joint.sliding
     torque, rows = torque_table.predict(model, joint).numpy(), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # The initial deflection was estimated from the torque of these rows.

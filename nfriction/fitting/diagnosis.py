@@ -571,8 +571,9 @@ def _corrected_torques(
         if gain and abs(gain - 1) > options.gain_term[0]:
             size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
             # Three digits, but 1000 and not 1e+03.
-            times = f"{float(f'{size:.3g}'):g} times too {way}"
-            wrong = f"is {times} (a unit, torque constant or gear ratio)"
+            times = f"{float(f'{abs(size):.3g}'):g} times too {way}"
+            wrong = "has the wrong sign and " * (gain < 0)
+            wrong += f"is {times} (a unit, torque constant or gear ratio)"
             cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
             yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
     needed = given.needed(plant)
@@ -957,9 +958,11 @@ def _unexplained(plant: Plant, data: _Data, extra: Tensor | None = None) -> floa
 
 def _of_noise(plant: Plant, data: _Data, sd: Tensor) -> float:
     """Share of the torque that its noise, and that of accelerations, explains [-]."""
-    steps = data.tau.reshape(-1, data.block, plant.joints).diff(dim=1)
-    white = steps.square().sum(1) / (2 * max(1, data.block - 1))
-    variance, needed = white / data.block, data.needed(plant)
+    variance, needed = torch.zeros_like(data.moving), data.needed(plant)
+    if data.block > 2:
+        # Neither the slope of the torque nor its jumps in some blocks count as noise.
+        curved = data.tau.reshape(-1, data.block, plant.joints).diff(n=2, dim=1)
+        variance += curved.square().mean(1).median(0).values / (6 * data.block)
     for own in torch.eye(plant.joints, dtype=sd.dtype):
         moved = replace(data, qdd=data.qdd + own * sd).needed(plant)
         variance = variance + data.mean((moved - needed).square())

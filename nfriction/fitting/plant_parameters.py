@@ -117,8 +117,7 @@ def _chain_terms(
     # scale together.
     for j in range(0 if driven and weight else 1, links):
         moment = _at(buffers, "gravity_moment", j) | coupled(*((i, j) for i in range(j)))
-        name = "gravity" if weight else "first moment"
-        yield from _ratio(buffers, f"{name} {j + 1}", moment, options.ratio_term)
+        yield from _ratio(buffers, f"gravity {j + 1}", moment, options.ratio_term)
     # Without weight, lengths only set the scale of these.
     for i in range(links - 1) if weight else ():
         carried = coupled(*((i, j) for j in range(i + 1, links)))

@@ -12,8 +12,8 @@ from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 
 # A coefficient for each input, behind the law's own.
 INPUTS = {
-    # Relative to the friction, so that it brakes in both directions and vanishes at rest; a
-    # constant torque would be the offset of a drive.
+    # Relative to the friction, so that it vanishes at rest, and below 1 brakes in both directions;
+    # a constant torque would be the offset of a drive.
     "direction": Coefficient("d", "-", positive=False, prior_scale=1.0),
     "load": Coefficient("F_n", "N m", prior_scale=1.0),
     # Replaces the load; it is periodic, between 0 and 1.

@@ -155,7 +155,7 @@ class Sensitivity:
             constant = mix.stride(0) == features.stride(0) == 0  # over the samples
             mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
             if constant and features.shape[-1] == 1:
-                both = cotangent.sum(2).transpose(1, 2) @ (mix * features[..., None])[0, 0]
+                both = cotangent.sum(2).transpose(1, 2) @ (mix[0, 0] * features[0, 0, ..., None])
             elif features.shape[-1] == 1:
                 # No shared features: one product over samples and coefficients is faster.
                 by_parameter = (mix * features[..., None]).transpose(1, 2).flatten(2, 3)

@@ -80,7 +80,11 @@ class Recording:
             object.__setattr__(self, key, value)
         check(arrays, self.names, self.unit)
         for finding, remedy in doubts(
-            self.time, self.q, self.names, self.unit, driven=self.tau is not None
+            self.time,
+            self.q,
+            self.names,
+            self.unit,
+            driven=self.tau is not None and bool(self.tau.any()),
         ):
             self._warn(finding, remedy, stacklevel=4)
 

@@ -48,6 +48,8 @@ _LIKE = {
 MINIMUM_ROWS = 8
 # Faster joints are in degrees per second, or wheels [rad/s].
 FAST = 60.0
+# Share of the largest velocity up to which a joint is at rest.
+RESTING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +89,10 @@ class JointTorque:
         some: dict[str, Any] = {k: None if x is None else x[index] for k, x in every.items()}
         return replace(self, **some)
 
-    def sliding(self, speed: float) -> JointTorque:
-        """Unordered rows faster than this; at rest dry friction can have any value."""
-        fast = np.abs(self.qd) > speed
+    @property
+    def sliding(self) -> JointTorque:
+        """Unordered rows without those at rest, where dry friction can have any value."""
+        fast = np.abs(self.qd) > RESTING * np.abs(self.qd).max()
         return self if self.time is not None or fast.all() or not fast.any() else self.rows(fast)
 
 
@@ -388,8 +391,7 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
             f"{name} does not move: its velocity is zero in every row, so friction has no "
             "direction; record motion in both directions."
         )
-    # Slower than a thousandth of the largest velocity does not count as motion in a direction.
-    ways = [float(np.mean(sign * qd > 1e-3 * largest)) for sign in (1, -1)]
+    ways = [float(np.mean(sign * qd > RESTING * largest)) for sign in (1, -1)]
     if min(ways) == 0.0:
         remarks.append(
             f"{name} moves in one direction only: an offset cannot be separated from Coulomb "

@@ -120,7 +120,8 @@ def _check_stamps(time: Array) -> None:
     before, after = float(time[k]), float(time[k + 1])
     if before > after:
         remedy = "sort the rows and drop repeated stamps"
-        if np.allclose(time[1:][steps < 0], time[0]):
+        usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+        if (np.abs(time[1:][steps < 0] - time[0]) <= 2 * usual).all():
             remedy = "it starts anew, so read each recording of the file by itself"
     elif abs(after) >= LARGE_STAMP:
         # The stamps of a clock have more digits than the logger wrote.

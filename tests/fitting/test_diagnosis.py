@@ -378,6 +378,19 @@ def test_rounding_at_a_steady_speed_is_no_mistake(inertia):
     assert warnings_of(Rotor(inertia), q, np.full_like(q, torque)) == ()
 
 
+def test_jumps_of_a_torque_are_no_noise_that_would_hide_a_mistake():
+    """At 50 Hz a block has few samples, and a torque that switches differs between them."""
+    time, switched = 0.02 * np.arange(1501), np.random.default_rng(0).choice([-3.0, 3.0], 751)
+    tau, plant = np.repeat(switched, 2)[:1501, None], Rotor(0.02)
+    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
+    rest = torch.zeros(1, dtype=torch.float64)
+    given = {"sample_time": 0.02, "substeps": 80, "gradients": False}
+    q = rollout(plant, model, rest, rest, torch.as_tensor(tau[:-1]), **given).q.numpy()
+    q = COUNT * np.round(q / COUNT)
+    assert re.search(r"10[0-9]{2} times too large", warnings_of(plant, q, 1e3 * tau, time=time)[0])
+    assert "reversed" in warnings_of(plant, -q, tau, time=time)[0]
+
+
 @pytest.mark.parametrize(("times", "named"), [(2, "repeated"), (0, "missing")])
 def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
     """A fit absorbs most of a wrong clock in the inertia, and seems good."""

@@ -370,6 +370,7 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
         ({"time": np.repeat(np.arange(30.0), 2)}, r"sample 1 \(30 such.*drop repeated rows; if"),
         ({"time": -np.arange(60.0)}, "`time` must increase"),
         ({"time": np.r_[0.0:30, 28:58]}, r"got 29\.0 then 28\.0 s at sample 30 .*sort the rows"),
+        ({"time": 1.7e9 + np.r_[0.0:30, 28:58]}, "sort the rows"),
         ({"time": np.r_[0.0:30, 0:30]}, r"got 29\.0 then 0\.0 s .*read each recording of the file"),
         (
             {"time": 1.7e9 + np.repeat(np.arange(30.0), 2)},
@@ -805,12 +806,12 @@ def test_positions_in_whole_degrees_or_counts_are_refused(size):
     assert Recording(time, np.ones_like(q)).joints == 1
 
 
-@pytest.mark.parametrize("driven", [True, False])
-def test_fast_turning_is_doubted_only_without_torques(driven: bool) -> None:
+@pytest.mark.parametrize(("torque", "doubted"), [(1.0, False), (0.0, True), (None, True)])
+def test_fast_turning_is_doubted_only_without_torques(torque: float | None, doubted: bool) -> None:
     """With torques, their balance shows whether a fast motion is one of a wheel or in degrees."""
     time = np.linspace(0.0, 1.0, 60)
-    q, tau = 50.0 * time[:, None], np.ones((60, 1)) if driven else None
+    q, tau = 50.0 * time[:, None], None if torque is None else np.full((60, 1), torque)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Recording(time, q, tau)
-    assert any("looks like degrees" in str(w.message) for w in caught) != driven
+    assert any("looks like degrees" in str(w.message) for w in caught) == doubted
