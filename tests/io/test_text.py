@@ -156,6 +156,8 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is not a unit of q"),
         ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is not a unit of q"),
         ("time;q1\nx;y\n0;1\n", "row 0 .* must be a number, got 'x'"),
+        ("time,q1\n2026-01-02T10:00:00,1\n2026-01-02T10:00:01,2\n", "dates and clock times in"),
+        ("time,q1\n00:00:00.5,1\n00:00:01.0,2\n", "dates and clock times in seconds"),
         ("# only: a comment\n", "no header"),
         ("time;q1\n0;\0\n", "NUL bytes"),
         ("time;q1\n" + '0;"1\n', "EOF inside string"),

@@ -82,9 +82,15 @@ def column_numbers(table: pd.DataFrame, column: str) -> Array:
         return cells.astype(np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         row = next(row for row, cell in enumerate(cells) if not is_number(cell))
+        got = shortened(repr(cells[row]), 80)
+        if re.search(r"\d:\d\d", got):
+            got += (
+                "; give dates and clock times in seconds, as `(x - x[0]).dt.total_seconds()` with "
+                "`x = pandas.to_datetime(...)`"
+            )
         raise ValueError(
             f"column {column}, row {row} (counted from 0 below the header) must be a number, "
-            f"got {shortened(repr(cells[row]), 80)}."
+            f"got {got}."
         ) from error
 
 
