@@ -318,7 +318,7 @@ class Comparison:
             }
             if fit := self.fits.get(name):
                 models[name]["coefficients"] = coefficient_summary(fit.model)
-                models[name]["fit"] = fit.to_dict()
+                models[name]["fit"] = fit.to_dict() | {"usability": list(self.rating(name))}
         best, judged = self.best(), None
         if best is not None:
             judged = {

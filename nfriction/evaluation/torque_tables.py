@@ -309,13 +309,14 @@ def fit_torque(
     # One velocity for all joints, as a model file has one.
     v_smooth = torque_table.turning_velocity(given)
     remarks = list(given.remarks)
-    for one in given.joints:
-        if resting := len(one) - len(one.sliding):
+    sliding = tuple(joint.sliding for joint in given.joints)
+    for all_rows, moving in zip(given.joints, sliding, strict=True):
+        if resting := len(all_rows) - len(moving):
             remarks.append(
-                f"{one.name} rests in {resting} of {len(one)} rows, which are left out: there "
-                "dry friction can have any value."
+                f"{moving.name} is at rest in {resting} of {len(all_rows)} rows, which are left "
+                "out: there dry friction can have any value."
             )
-    given = replace(given, joints=tuple(one.sliding for one in given.joints))
+    given = replace(given, joints=sliding)
     fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
     failed: dict[str, str] = {}

@@ -139,7 +139,7 @@ def likely_mistakes(
         # A torque that is held until the next sample acts up to one step late.
         if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
             sound = min(delay[1], sound)
-    tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
+    tested = [*_tested(plant, recordings, motions, convention, given, options, delay, stated)]
     for term, x, rig in _scaled_terms(plant, given, options):
         share = _unexplained(rig, given)
         if term.lower <= x <= term.upper:
@@ -266,6 +266,7 @@ def _tested(
     given: _Data,
     options: FitOptions,
     delay: tuple[float, float],
+    stated: float,
 ) -> Iterator[tuple[str, float]]:
     for text, data in _corrected_positions(plant, convention, given):
         yield text, _unexplained(plant, data)
@@ -280,8 +281,7 @@ def _tested(
         for text, data in drives:
             yield text, _unexplained(plant, data)
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
-        noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd)
-        if noise < _unexplained(plant, given):
+        if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
             yield from _elastic(plant, given, recordings[0].sample_time)
     for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)

@@ -122,7 +122,7 @@ def _check_stamps(time: Array) -> None:
         remedy = "sort the rows and drop repeated stamps"
         usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
         if (np.abs(time[1:][steps < 0] - time[0]) <= 2 * usual).all():
-            remedy = "it starts anew, so read each recording of the file by itself"
+            remedy = "it starts again there, so read each recording in the file separately"
     elif abs(after) >= LARGE_STAMP:
         # The stamps of a clock have more digits than the logger wrote.
         remedy = "write large stamps with more digits, or count from the recording's start"

@@ -294,8 +294,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     ]
     if intervals:
         shown.append(tables.interval_table(name, intervals, bool(fit.plant), fit.warnings))
-    unfit = run.unfit.get(name)
-    verdict, why = ("do not use", f"in the test, {unfit}") if unfit else fit.usability
+    verdict, why = fit.usability
     return {
         "name": name,
         "record": fit,

@@ -242,7 +242,7 @@ def test_rows_at_rest_are_left_out() -> None:
     sliding = 0.1 * np.sign(qd) + 0.02 * qd + 0.002 * rng.normal(size=280)
     table = pd.DataFrame({"qd": qd, "tau": np.where(qd, sliding, rng.uniform(-0.1, 0.1, 280))})
     found = fit_torque(table, "coulomb-viscous")
-    assert "joint1 rests in 200 of 280 rows, which are left out" in found.table.remarks[0]
+    assert "joint1 is at rest in 200 of 280 rows, which are left out" in found.table.remarks[0]
     dry, viscous = found.fits["CVFM"][0].intervals
     assert dry.low < 0.1 < dry.high < dry.low + 0.01
     assert viscous.low < 0.02 < viscous.high < viscous.low + 0.002
