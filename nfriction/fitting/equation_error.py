@@ -179,14 +179,16 @@ def fit_equation_error(
     v_smooth: float = V_SMOOTH,
     options: FitOptions = DEFAULTS,
     beyond: float = 0.0,
+    known: Tensor | None = None,
 ) -> TorqueFit:
     """Least squares of the friction torque, joint by joint.
 
     Linear least squares within bounds for the linear coefficients, at every combination of the
-    law's initial values of the others, which are then refined. Samples are left out if their
-    direction of motion is uncertain, or if the joint has moved by less than `beyond` times its
-    range since the last reversal. A robust loss weights the squares. Recordings and motions are in
-    joint coordinates.
+    law's initial values of the others, which are then refined. Coefficients that are not fitted
+    keep their values in `known`, (joint, coefficient), by default the initial ones. Samples are
+    left out if their direction of motion is uncertain, or if the joint has moved by less than
+    `beyond` times its range since the last reversal. A robust loss weights the squares. Recordings
+    and motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
@@ -210,7 +212,7 @@ def fit_equation_error(
         replace(part, kept=rows)
         for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
     ]
-    found = regress(law, parts, v_smooth, options)
+    found = regress(law, parts, v_smooth, options, known)
     weights = zip(recordings, found.weight.split([len(r) for r in recordings]), strict=True)
     named = (outlier for r, weight in weights for outlier in named_outliers(r, weight.numpy()))
     return replace(found, outliers=tuple(named))
@@ -234,11 +236,17 @@ def steady_law(law: Law) -> Law:
 
 
 def regress(
-    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
+    law: Law,
+    parts: Sequence[TorqueBalance],
+    v_smooth: float,
+    options: FitOptions = DEFAULTS,
+    known: Tensor | None = None,
 ) -> TorqueFit:
-    """Least squares of the kept samples of torque balances; errors as of `fit_equation_error`."""
+    """Least squares of the kept samples of torque balances; see `fit_equation_error`."""
     torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
-    regression = _Regression(law, parts, torque, kept, kept.to(torque), v_smooth, options)
+    if known is None:
+        known = Constant(law, torque.shape[1]).values.detach()
+    regression = _Regression(law, known, parts, torque, kept, kept.to(torque), v_smooth, options)
     coefficients, starts = regression.solve()
     if options.loss != "linear":
         for _ in range(REWEIGHTINGS):
@@ -266,10 +274,12 @@ def regress(
 class _Regression:
     """Residuals of torque balances as a function of all coefficients of a law.
 
-    `root` is the square root of each sample's weight, 0 where it is not `kept`, (sample, joint).
+    `known` are values of coefficients that are not fitted, (joint, coefficient); `root` is the
+    square root of each sample's weight, 0 where it is not `kept`, (sample, joint).
     """
 
     law: Law
+    known: Tensor
     parts: Sequence[TorqueBalance]
     torque: Tensor
     kept: Tensor
@@ -280,9 +290,13 @@ class _Regression:
     def solve(self) -> tuple[Tensor, Tensor]:
         """The best coefficients, and those at each combination of initial values."""
         law, candidates = self.law, []
-        nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
-        for values in itertools.product(*nonlinear.values()):
-            fixed = dict(zip(nonlinear, values, strict=True))
+        grids = {
+            i: [known.new_full(known.shape[:1], x) for x in c.initial_grid] if c.fitted else [known]
+            for i, (c, known) in enumerate(zip(law.coefficients, self.known.T, strict=True))
+            if not (c.linear and c.fitted)
+        }
+        for values in itertools.product(*grids.values()):
+            fixed = dict(zip(grids, values, strict=True))
             columns = [_design(law, p.qd, p.load, self.v_smooth, fixed) for p in self.parts]
             design = torch.cat([p.smoothed(c) for p, c in zip(self.parts, columns, strict=True)])
             candidates.append(self._linear_fit(design, fixed))
@@ -336,12 +350,12 @@ class _Regression:
         found = solver.minimise(model, coefficients.reshape(-1), lower=lower, upper=upper)
         return found.x.reshape(coefficients.shape)
 
-    def _linear_fit(self, design: Tensor, fixed: dict[int, float]) -> tuple[Tensor, Tensor]:
-        """Coefficients (joint, coefficient) and residual (joint,) for given nonlinear ones."""
+    def _linear_fit(self, design: Tensor, fixed: dict[int, Tensor]) -> tuple[Tensor, Tensor]:
+        """Coefficients (joint, coefficient) and residual (joint,) for given values of some."""
         from scipy.optimize import lsq_linear  # slow to import
 
         law, joints = self.law, self.torque.shape[1]
-        linear = [i for i, c in enumerate(law.coefficients) if c.linear]
+        linear = [i for i in range(len(law.coefficients)) if i not in fixed]
         lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
         coefficients = torch.zeros(joints, len(law.coefficients), dtype=self.torque.dtype)
         for k, value in fixed.items():
@@ -350,8 +364,9 @@ class _Regression:
         for joint in range(joints):
             rows = self.kept[:, joint]
             root = self.root[rows, joint]
-            a = (root[:, None] * design[rows, joint]).numpy()
-            y = (root * self.torque[rows, joint]).numpy()
+            *columns, without = design[rows, joint].T
+            a = (root * torch.stack(columns)).numpy().T if columns else np.zeros((len(root), 0))
+            y = (root * (self.torque[rows, joint] - without)).numpy()
             # Columns of unit length, because coefficients differ by orders of magnitude.
             scale = np.linalg.norm(a, axis=0)
             scale[scale == 0] = 1.0
@@ -370,22 +385,27 @@ class _Regression:
         return coefficients, residual
 
 
-def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, float]) -> Tensor:
-    """Torque per unit of each linear coefficient, (sample, joint, coefficient)."""
-    linear = [i for i, c in enumerate(law.coefficients) if c.linear]
-    columns = []
-    for i in linear:
-        unit = torch.zeros(*qd.shape, len(law.coefficients), dtype=qd.dtype)
-        for k, value in {i: 1.0, **fixed}.items():
-            unit[..., k] = value
-        columns.append(law.torque(qd, load, unit, v_smooth))
-    design = torch.stack(columns, -1)
+def _design(
+    law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, Tensor]
+) -> Tensor:
+    """Torque per unit of each other coefficient, and without them, (sample, joint, other + 1)."""
+    none = torch.zeros(*qd.shape, len(law.coefficients), dtype=qd.dtype)
+    for k, value in fixed.items():
+        none[..., k] = value
+    others = [i for i in range(len(law.coefficients)) if i not in fixed]
+    without, columns = law.torque(qd, load, none, v_smooth), []
+    for i in others:
+        unit = none.clone()
+        unit[..., i] = 1.0
+        columns.append(law.torque(qd, load, unit, v_smooth) - without)
+    design = torch.stack([*columns, without], -1)
     for sample, joint, k in (~torch.isfinite(design)).nonzero()[:1].tolist():
+        ones = [f"{law.names[i]} is 1" for i in others]
+        unit_of = [*ones, "its coefficients are 0"][k]
         raise ValueError(
-            f"law {law.name!r} gives {float(design[sample, joint, k]):g} where "
-            f"{law.coefficients[linear[k]].name} is 1, at joint {joint + 1}, velocity "
-            f"{float(qd[sample, joint]):g} and load {float(load[sample, joint]):g}; its torque "
-            "must be a finite number."
+            f"law {law.name!r} gives {float(design[sample, joint, k]):g} where {unit_of}, at joint "
+            f"{joint + 1}, velocity {float(qd[sample, joint]):g} and load "
+            f"{float(load[sample, joint]):g}; its torque must be a finite number."
         )
     return design
 

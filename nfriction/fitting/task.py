@@ -14,6 +14,7 @@ from nfriction.fitting.data import inputs
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
@@ -60,6 +61,7 @@ def prepare_task(
     # Checked before much time is spent on recordings.
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
+    inputs.require_elementwise(model.law)
     if plant.has_position_load and not has_input(model.law, "position"):
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
@@ -120,8 +122,13 @@ def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float 
     """Constant coefficients implied by the torques on a plant; see `fit_equation_error`."""
     model.check_loads(plant)
     recordings = inputs.advanced_torques(task.recordings, task.delay)
+    law = steady_law(model.law)
+    # Of a law with memory, more coefficients are kept here than in the fit.
+    fitted = torch.tensor([c.fitted for c in model.law.coefficients])
+    initial, own = Constant(law, model.joints).values, model.schedule.coefficient_sets()
+    known = torch.where(fitted, initial, own.get("always", initial)).detach()
     return fit_equation_error(
-        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond
+        law, plant, recordings, task.motions, model.v_smooth, task.options, beyond, known
     )
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from nfriction import LinearAxis, Recording, Stribeck, fit
+from nfriction.fitting.data.inputs import require_elementwise
 from nfriction.fitting.equation_error import (
     TorqueFit,
     fit_equation_error,
@@ -13,9 +14,11 @@ from nfriction.fitting.equation_error import (
 )
 from nfriction.fitting.options import DEFAULTS
 from nfriction.friction import model_by_name
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
+from nfriction.friction.models import FrictionModel
 from nfriction.signals import Motion
-from tests.fitting.recordings import flywheel, pendulum
+from tests.fitting.recordings import driven_axis, flywheel, pendulum
 
 V_SMOOTH = 0.05
 EDGE = DEFAULTS.edge
@@ -170,3 +173,44 @@ def test_a_regression_names_what_it_found_none_of():
     assert found.at_bounds == ("F_v of joint1",)
     assert any(w.startswith("At zero: F_v of joint1") for w in found.warnings)
     assert any("smoothed motion" in w for w in found.warnings)
+
+
+def test_coefficients_that_are_not_fitted_keep_the_values_of_the_model():
+    """A linear one of an own law, and the exponent of Stribeck friction."""
+
+    def both(qd, load, coefficients, v_smooth):
+        f_c, f_v = coefficients.unbind(-1)
+        return f_c * torch.tanh(qd / v_smooth) + f_v * qd
+
+    kept = Coefficient("F_v", "N m s/rad", fitted=False)
+    law = Law("both", (Coefficient("F_c", "N m"), kept), both)
+    axis, given = LinearAxis(2.0), {"windows": (0.5,), "fit_plant": False}
+    truth = FrictionModel(law, Constant(law, 1, [0.8, 0.3]), v_smooth=0.05)
+    measured = driven_axis(axis, truth)
+    for f_v, f_c in ((0.3, pytest.approx(0.8, rel=0.01)), (0.0, pytest.approx(1.0, abs=0.15))):
+        model = FrictionModel(law, Constant(law, 1, [0.1, f_v]), v_smooth=0.05)
+        found = fit(model, axis, measured, **given).model.schedule.coefficient_sets()["always"]
+        assert found.tolist() == [[f_c, pytest.approx(f_v, abs=1e-9)]]
+        assert (found[0, 0] > 0.85) == (f_v == 0.0)  # the rest replaces it
+    shape = Stribeck(1, [[0.5, 0.1, 0.1, 0.2, 1.5]], v_smooth=0.05)
+    for method in ("equation_error", "output_error"):
+        found = fit(shape, axis, measured, **given | {"method": method})
+        assert float(found.model.schedule.coefficient_sets()["always"][0, 4]) == 1.5
+
+
+@pytest.mark.parametrize(
+    ("torque", "message"),
+    [
+        (lambda qd, c: torch.tensor(np.tanh(qd.numpy())) * c[..., 0], "it fails: "),
+        (lambda qd, c: c[..., 0] * qd if qd > 0 else 0.0 * qd, "it fails: "),
+        (lambda qd, c: torch.tanh(qd), "it fails: "),
+        (lambda qd, c: (c[..., 0] * qd).sum(-1), r"it gives shape \(3,\) for \(3, 2\)"),
+        (lambda qd, c: c[..., 0] * (qd - qd.mean()), "depend on the other samples"),
+    ],
+)  # fmt: skip
+def test_a_law_that_is_not_elementwise_is_refused_by_name(torque, message):
+    def law(qd, load, coefficients, v_smooth):
+        return torque(qd, coefficients)
+
+    with pytest.raises(ValueError, match=f"law 'mine' must be an elementwise.*{message}"):
+        require_elementwise(Law("mine", (Coefficient("F_c", "N m"),), law))

@@ -152,7 +152,9 @@ def constant_start(task: FitTask) -> FitResult:
     model, start = task.model, task.start
     if is_constant_fit(start, model) and _offsets_match(start, task):
         return start
-    constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
+    # With its values of coefficients that are not fitted.
+    values = model.schedule.coefficient_sets().get("always")
+    constant = FrictionModel(model.law, Constant(model.law, model.joints, values), model.v_smooth)
     return fit_constant(replace(task, model=constant)).with_warnings(task.data_warnings)
 
 

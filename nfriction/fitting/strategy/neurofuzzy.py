@@ -71,7 +71,9 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     widens, own = bool({"heat", "position"} & {*given}), task
     if widens:
         law = cast("NeuroFuzzyModel", task.model).definition
-        cold = FrictionModel(law, Constant(law, task.model.joints), task.model.v_smooth)
+        values = task.model.schedule.coefficient_sets().get("always")
+        values = None if values is None else values[:, : len(law.names)]
+        cold = FrictionModel(law, Constant(law, task.model.joints, values), task.model.v_smooth)
         own = replace(task, model=cold)
     start = constant_start(own)
     recordings, motions = apply_encoder_offsets(
