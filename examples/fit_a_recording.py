@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from nfriction import LFM, NCFM, Recording, fit, save, score
+from nfriction import LFM, NCFM, Recording, fit, model_info, save, score
 from nfriction.papers import twin
 
 
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                   f"{interval.high:.4g})")  # fmt: skip
         errors[name] = score(found.plant, found.model, test).free_run.all
         print(f"  position error on {test.name}: {1e3 * errors[name]:.3g} mrad")
-        save(found.model, arguments.out / f"{name}.json")
+        save(found.model, arguments.out / f"{name}.json", model_info(found, train))
     best = min(errors, key=lambda name: errors[name])
     print(f"best: {best}, in {arguments.out / best}.json")
     return 0

@@ -7,6 +7,7 @@ from .evaluation.compare import compare as compare
 from .evaluation.cross_validation import Selection as Selection
 from .evaluation.cross_validation import select as select
 from .evaluation.estimators import FrictionEstimator as FrictionEstimator
+from .evaluation.results import model_info as model_info
 from .evaluation.score import Score as Score
 from .evaluation.score import score as score
 from .evaluation.sessions import SessionsResult as SessionsResult

@@ -25,8 +25,8 @@ class UnsupportedOperation(CodegenError):  # noqa: N818
     def __init__(self, operation: str, reason: str = "has no scalar form here") -> None:
         super().__init__(
             f"operation `{operation}` {reason}; rewrite it with the operations listed in "
-            "`nfriction.codegen.supported_operations()`, or use the torch rollout "
-            '(`backend="torch"`), which runs every module.'
+            "`nfriction.codegen.supported_operations()`; otherwise fits are slow, and "
+            'simulations need `rollout(..., backend="torch")`.'
         )
         self.operation = operation
 

@@ -80,6 +80,19 @@ def _div(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
     return g.apply("div", over, b)
 
 
+def _pow(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+    a, b = node.args
+    terms = []
+    if da is not None:
+        lower = g.apply("pow", a, g.apply("sub", b, g.constant(1.0)))
+        terms.append(g.apply("mul", da, g.apply("mul", b, lower)))
+    if db is not None:
+        zero, rise = g.constant(0.0), g.apply("mul", node, g.apply("log", a))
+        # At 0 the power stays 0, while the logarithm is infinite.
+        terms.append(g.apply("mul", db, g.apply("where", g.apply("eq", a, zero), zero, rise)))
+    return g.total(terms)
+
+
 def _where(g: Graph, node: Node, _: Node | None, da: Node | None, db: Node | None) -> Node:
     # Only the branch taken matters; NaN from the other one is not propagated.
     zero = g.constant(0.0)
@@ -116,6 +129,7 @@ _RULES: dict[str, Rule] = {
     "sub": _sub,
     "mul": _mul,
     "div": _div,
+    "pow": _pow,
     "where": _where,
     "max": _select("max"),
     "min": _select("min"),

@@ -206,9 +206,14 @@ class Comparison:
         return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
 
     def limit(
-        self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
+        self,
+        horizon: str | None = None,
+        column: str = "all",
+        *,
+        part: Part = "test",
+        model: str | None = None,
     ) -> float | None:
-        """Error that noise and integration can cause in simulations of the best model.
+        """Error that noise and integration can cause in simulations of a model.
 
         Smaller differences between models are not meaningful.
 
@@ -216,6 +221,7 @@ class Comparison:
             horizon: window length as in `Score.windows`; None for the free run.
             column: joint of the tables, or `"all"`.
             part: `"test"` or `"train"`.
+            model: the model; None for the best of the part.
 
         Returns:
             Root mean square over its recordings [rad or m]; None if the limit was not requested or
@@ -223,7 +229,7 @@ class Comparison:
         """
         place = [*self.joint_names, "all"].index(column)
         squares = []
-        for of in (s.limit for s in self.scores(part)[self.nearest(part)]):
+        for of in (s.limit for s in self.scores(part)[model or self.nearest(part)]):
             error = of and (of.free_run if horizon is None else of.windows.get(horizon))
             if not isinstance(error, RMSE):
                 return None
@@ -253,23 +259,26 @@ class Comparison:
         """Models not to be used, with the reason: one no larger predicts the test far better.
 
         A model extrapolates wrongly if no friction, or with half its error a model with no more
-        parameters, is better by more than the limit of these data. Any larger error is unfit, too.
+        parameters, is better by more than the limit of these data. Any larger error is unfit, too,
+        unless noise alone can cause it: near sticking, the law of the rig itself may err by far.
         """
         if not self.test:
             return {}
         rmse, limit = self.table()["all"], self.limit() or 0.0
-        found = {}
+        found, excused = {}, [NO_FRICTION]
         for name, error in rmse.items():
             smaller = rmse[[self._parameters(n) <= self._parameters(str(name)) for n in rmse.index]]
             least = smaller.min()
+            if error <= (self.limit(model=str(name)) or 0.0):
+                excused.append(str(name))
             # Where all of these diverge, none is known to be better.
-            if np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
+            elif np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
                 best = f"{smaller.idxmin()} with no more parameters has {1e3 * least:.3g}"
                 own = f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges"
                 found[str(name)] = f"{best} m{self.unit}, {own}"
             elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
                 found[str(name)] = "no friction predicts better"
-        for name in rmse.index[rmse >= rmse[[*found]].min()].drop(NO_FRICTION, errors="ignore"):
+        for name in rmse.index[rmse >= rmse[[*found]].min()].drop(excused, errors="ignore"):
             found.setdefault(str(name), "it predicts no better than a model that is not to be used")
         return found
 

@@ -47,8 +47,17 @@ def digests(recordings: Sequence[Recording]) -> dict[str, str]:
     }
 
 
-def model_info(fit: FitResult, recordings: Sequence[Recording], run: str = "") -> ModelInfo:
-    """Entries of a model file that describe a fit to these recordings, and the id of its run."""
+def model_info(
+    fit: FitResult, recordings: Recording | Sequence[Recording], run: str = ""
+) -> ModelInfo:
+    """Description of a fit for `save` and exports: rig, ranges of the training data, rating.
+
+    Args:
+        fit: the result; ranges are those of its smoothed motions [rad/s, rad/s²; m/s, m/s²].
+        recordings: to which it was fitted; their digests and sample time [s] are included.
+        run: id of the run that made it.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     qd = np.concatenate([m.qd for m in fit.motions])
     qdd = np.concatenate([m.qdd for m in fit.motions])
     times = sorted(r.sample_time for r in recordings)

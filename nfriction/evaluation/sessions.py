@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from nfriction.evaluation.parallel import Progress, as_completed, check_jobs
 from nfriction.fitting.fit import fit
+from nfriction.fitting.result.fit_result import Usability
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -38,13 +39,14 @@ class SessionFit(NamedTuple):
 
     `values` and standard deviations of the coefficients and plant terms are by name, the latter
     infinite where the session does not determine them; the `residual` is the root mean square
-    position error of its windows [rad; m].
+    position error of its windows [rad; m]; the rating is that of `FitResult.usability`.
     """
 
     values: dict[str, float]
     sd: dict[str, float]
     residual: float
     status: str
+    usability: tuple[Usability, str]
     warnings: tuple[str, ...]
 
 
@@ -68,7 +70,8 @@ class SessionsResult:
 
     Attributes:
         spreads: mean, spread and intervals of each parameter.
-        failed: reason by session that could not be fitted.
+        failed: reason by session that could not be fitted, or whose fit is not to be used; its
+            values do not count.
     """
 
     model: FrictionModel
@@ -105,7 +108,8 @@ def fit_sessions(
         **fit_settings: as for `fit`.
 
     Returns:
-        Means, spreads and intervals. Sessions that cannot be fitted are listed, not fatal.
+        Means, spreads and intervals. Sessions that cannot be fitted, or whose fit is rated "do not
+        use", are listed, not fatal.
 
     Raises:
         ValueError: for fewer than 3 sessions, coefficients that follow the motion, or if fewer than
@@ -161,6 +165,9 @@ def _fit_session(
         found = fit(copy.deepcopy(model), plant, session, **settings)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         return str(error)
+    rating, reason = found.usability
+    if rating == "do not use":
+        return f"{rating}: {reason}"
     # Motions and residuals are not returned: a thousand of them would fill the memory.
     unknown = set(" with ".join(found.unidentifiable).split(" with "))
     return SessionFit(
@@ -168,6 +175,7 @@ def _fit_session(
         {i.name: math.inf if i.name in unknown else i.sd for i in found.intervals},
         found.residual,
         found.status,
+        (rating, reason),
         found.warnings,
     )
 

@@ -114,7 +114,7 @@ def fit_joint(
         root[free] = part_root
         fitted = [names[i] for i in free.tolist()]
         intervals = confidence_intervals(
-            fitted, values[0][free], part_root.norm(dim=1), lower[free], upper[free]
+            fitted, values[0][free], part_root.norm(dim=1), lower[free], upper[free], law
         )
         unknown = null_directions(fitted, own)
     else:
@@ -219,7 +219,7 @@ def fit_memory(
     fitted = [names[k] for k in kept]
     lower, upper = (bound[kept] for bound in schedule.bounds())
     values = schedule.parameter_vector()[kept]
-    intervals = confidence_intervals(fitted, values, own.norm(dim=1), lower, upper)
+    intervals = confidence_intervals(fitted, values, own.norm(dim=1), lower, upper, model.law)
     residual = float(error.square().mean().sqrt())
     fit = JointFit(
         model.requires_grad_(False), intervals, (*unknown, *null_directions(fitted, known)), root,

@@ -393,6 +393,8 @@ def _texts(name: str, values: object) -> tuple[str, ...]:
 
 def number(name: str, value: object, *, positive: bool = False) -> float:
     """One finite number, or an error that names it."""
+    if isinstance(value, list | tuple):
+        raise ValueError(f"`{name}` must be one number, got {reprlib.repr(value)}.")
     return vector(name, [value], 1, positive=positive).item()
 
 

@@ -46,7 +46,8 @@ class Recording:
         time: [s], increasing, shape (time,).
         q: position [rad or m, as `unit` states], shape (time, joint).
         tau: joint torque [N m, or N], shape like `q`.
-        qd: measured velocity [rad/s, or m/s], shape like `q`.
+        qd: measured velocity [rad/s, or m/s], shape like `q`. Fits compare it with the derivative
+            of `q`, and use only the latter.
         names: one name per joint, "joint1" … by default.
         convention: of `q` and `qd`, or None for the plant's; words such as "absolute,hanging" or a
             plant become an `AngleConvention`. Torques are joint torques in every convention.
@@ -260,7 +261,7 @@ class Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
         If some joints have a torque, the others are taken to be undriven, with zero torque.
-        Velocity is used if every joint has it; other columns are ignored. In place of q1 and tau1
+        Velocity is read if every joint has it; other columns are ignored. In place of q1 and tau1
         the table may have motor1, the angle of the joint's motor [rad], and current1 [A], which the
         plant's `Motor` converts.
 

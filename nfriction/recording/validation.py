@@ -37,6 +37,8 @@ def gaps(time: Array) -> NDArray[np.intp]:
 def read_only(values: ArrayLike, key: str) -> Array:
     """A read-only float64 copy."""
     try:
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(np.float64), np.nan)  # missing, as in a table
         # `asarray` first, because a tensor does not accept `copy`.
         array = np.array(np.asarray(values), dtype=np.float64)
     except (TypeError, ValueError) as error:

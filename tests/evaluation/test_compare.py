@@ -344,6 +344,12 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     assert set(scored(equal, **errors | {"NCFM": 2.0}).unfit()) == {"LFM"}
     # The data do not separate these.
     assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}
+    # Near sticking, noise can make the law of the rig err like this: the best one was lucky.
+    errors = {"no_friction": 9.0, "NCFM": 1.0, "LFM": 3.0}
+    sensitive = scored(found, 0.1, **errors)
+    sensitive.test["LFM"] = scored(found, 3.0, **errors).test["LFM"]
+    assert set(scored(found, 0.1, **errors).unfit()) == {"LFM"}
+    assert sensitive.unfit() == {}
     assert dataclasses.replace(found, test={}).unfit() == {}
 
 

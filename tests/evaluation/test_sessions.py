@@ -101,3 +101,15 @@ def test_a_parameter_that_few_sessions_determine_has_no_interval():
     found = random_effects("x", np.ones(5), np.array([0.1, 0.1, *[math.inf] * 3]))
     assert math.isnan(found.mean)
     assert (found.next_low, found.next_high) == (-math.inf, math.inf)
+
+
+def test_a_session_whose_fit_is_not_to_be_used_does_not_count():
+    sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(4)}
+    sound = sessions["day 1"]
+    # Time runs backwards: the motion gains energy.
+    sessions["day 1"] = Recording(sound.time, sound.q[::-1], convention=sound.convention)
+    found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5,), drag=False)
+    assert list(found.failed) == ["day 1"]
+    assert found.failed["day 1"].startswith("do not use: ")
+    assert {one.usability[0] for one in found.fits.values()} == {"good"}
+    assert found.spreads[0].sessions == 3

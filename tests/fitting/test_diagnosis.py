@@ -163,7 +163,7 @@ def test_a_fit_to_a_motor_whose_gear_has_play_is_doubtful():
     given = {"windows": (0.1,), "max_steps": 1}
     found = fit(CVFM(1), PendulumChain(**MOTOR), recording, **given)
     assert found.usability[0] == "doubtful"
-    assert "a gear has play" in found.usability[1]
+    assert "is loose after it reverses" in found.usability[1]
     again = fit(CVFM(1), PendulumChain(**MOTOR), recording, start=found, **given)
     assert again.unmodelled == found.unmodelled
 
@@ -905,3 +905,23 @@ def test_an_encoder_without_visible_count_excuses_no_law():
     settings = {"windows": (1.0,), "fit_plant": False}
     assert fit(CVFM(1), plant, recording, **settings).usability == ("good", "")
     assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
+
+
+def test_a_spike_of_the_torque_is_named_with_its_time():
+    plant, q, tau = measured("driven")
+    tau = tau.copy()
+    tau[1000, 0] += 50.0 * np.abs(tau).max()
+    (found,) = (w for w in warnings_of(plant, q, tau) if "one sample" in w)
+    assert "the torque of joint1 jumps for one sample at 2 s;" in found
+
+
+@pytest.mark.parametrize("factor", [1.0, -1.0, 100.0])
+def test_velocities_that_are_not_the_derivative_of_positions_are_named(factor):
+    plant, q, tau = measured("driven")
+    qd = factor * np.gradient(q, STEP, axis=0)
+    recording = Recording(STEP * np.arange(len(q)), q, tau, qd, convention="relative,upright")
+    found = [w for w in prepare_task(CVFM(2), plant, recording, FitOptions()).data_warnings
+             if "derivative" in w]  # fmt: skip
+    assert len(found) == (0 if factor == 1.0 else 2)
+    for text in found:
+        assert float(re.findall(r"is (\S+) times", text)[0]) == pytest.approx(factor, rel=0.1)

@@ -151,11 +151,11 @@ def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs,
     monkeypatch.setattr("nfriction.fitting.diagnosis.changing_friction", lambda *_: falls)
     recording = swing(pendulum(), truth("heat"), seconds=3.0)
     law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
-    assert "friction changes" in law.usability[1]
+    assert "falls by 30 %" in law.usability[1]
     model = NFCVFM(2, v_smooth=V_SMOOTH, inputs=inputs)
     found = fit(model, pendulum(), recording, start=law, max_steps=1, **BRIEF)
     assert falls[0] in found.warnings
-    assert ("friction changes" in found.usability[1]) == (not inputs)
+    assert ("falls by 30 %" in found.usability[1]) == (not inputs)
 
 
 ONE = torch.ones(6, dtype=torch.float64)

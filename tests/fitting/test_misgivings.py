@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
+from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, Rotor, fit
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from tests.fitting.recordings import COUNTS, pendulum, swing
@@ -144,3 +144,14 @@ def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
     assert {"F_c of joint1", "F_v of joint1"} <= set(
         " with ".join(found.unidentifiable).split(" with ")
     )
+
+
+@pytest.mark.parametrize("method", ["output_error", "equation_error"])
+def test_friction_of_a_joint_that_a_torque_never_moves_is_not_determined(method):
+    """The smoothed sign of a simulation creeps, which looks like information."""
+    time = 2e-3 * np.arange(1500)
+    tau = 0.25 * np.sin(3.0 * time)[:, None]
+    held = Recording(time, np.zeros((1500, 1)), tau, name="held")
+    found = fit("coulomb-viscous", Rotor(inertia=0.05), held, windows=(0.5,), method=method)
+    assert {"F_c of joint1", "F_v of joint1"} <= {*found.unidentifiable}
+    assert found.usability[0] != "good"

@@ -1,5 +1,7 @@
 """Intervals cover as often as they say, and what nobody can tell is named."""
 
+import math
+
 import pytest
 import torch
 
@@ -15,6 +17,7 @@ from nfriction.fitting.result.identifiability import (
     warnings_of,
     weakly_identified,
 )
+from nfriction.friction.laws import STRIBECK
 
 F64 = torch.float64
 NAMES = ("a", "b", "c")
@@ -185,3 +188,14 @@ def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
         **good | {"at_bounds": ["B"], "unidentifiable": ["B of joint1"]}, at_zero=["B"]
     )
     assert "Not identifiable" in lost
+
+
+def test_intervals_of_scales_are_multiplicative():
+    """A Stribeck velocity may be half or twice the estimate, but not negative."""
+    names = ("F_c of joint1", "v_s of joint1")
+    value, sd = torch.tensor([0.3, 0.1], dtype=F64), torch.tensor([0.01, 0.05], dtype=F64)
+    free = torch.full((2,), torch.inf, dtype=F64)
+    linear, scale = confidence_intervals(names, value, sd, -free, free, STRIBECK)
+    assert linear.high - linear.value == pytest.approx(linear.value - linear.low)
+    assert scale.high / scale.value == pytest.approx(scale.value / scale.low)
+    assert scale.high / scale.value == pytest.approx(math.exp(1.96 * 0.5), rel=1e-4)

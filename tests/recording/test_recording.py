@@ -815,3 +815,11 @@ def test_fast_turning_is_doubted_only_without_torques(torque: float | None, doub
         warnings.simplefilter("always")
         Recording(time, q, tau)
     assert any("looks like degrees" in str(w.message) for w in caught) == doubted
+
+
+def test_masked_samples_count_as_missing() -> None:
+    time, q = 1e-3 * np.arange(20), np.zeros((20, 1))
+    masked = np.ma.masked_array(q, mask=np.arange(20)[:, None] == 3)
+    with pytest.raises(ValueError, match=r"`q1` must be finite, .* nan at sample 3"):
+        Recording(time, masked)
+    assert len(Recording(time, np.ma.masked_array(q))) == 20

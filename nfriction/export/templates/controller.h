@@ -18,7 +18,7 @@
 {% for name in about.joint_names or range(1, joints + 1) %}
  *     {{ safe(name) if about.joint_names else "joint %d" % name }}
 {% endfor %}
- * Trained ranges:
+ * Trained ranges:{{ " unknown, so OUTSIDE is never set" if not about.input_ranges }}
 {% for name, edges in about.input_ranges | dictsort %}
  *     {{ safe(name) }}: {{ safe(edges) }}
 {% endfor %}

@@ -394,7 +394,10 @@ def data_warnings(
     """Warnings about recordings as given and in joint coordinates, one sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    of_logs = *_unlike_clocks(given, options), *_spikes(given, options), *finer_counts(plant, given)
+    of_logs = (
+        *_unlike_clocks(given, options), *_spikes(given, options), *_torque_spikes(given, options),
+        *_velocities(joint, motions), *finer_counts(plant, given),
+    )  # fmt: skip
     return (*of_logs, *still, *heavy)
 
 
@@ -417,9 +420,37 @@ def finer_counts(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
         )
 
 
+def require_elementwise(law: Law) -> None:
+    """Raise ValueError unless the torque is elementwise and consists of torch operations."""
+    qd = torch.tensor([[0.5, -1.5], [0.0, 2.0], [-0.1, 0.3]], dtype=torch.float64)
+    coefficients = torch.full((*qd.shape, len(law.names)), 0.5, dtype=torch.float64)
+    rule = (
+        f"the torque of law {law.name!r} must be an elementwise function of torch operations, of "
+        "velocity and load (*batch, joint) and coefficients (*batch, joint, coefficient)"
+    )
+
+    def torque(rows: slice) -> Tensor:
+        return law.torque(qd[rows], torch.ones_like(qd[rows]), coefficients[rows], 1e-3)
+
+    try:
+        # Neither copies in NumPy nor changes in place pass.
+        qd.requires_grad_()
+        coefficients.requires_grad_()
+        with torch.enable_grad():
+            whole = torque(slice(None))
+            torch.autograd.grad(whole.sum(), coefficients)
+        alone = torch.cat([torque(slice(k, k + 1)) for k in range(len(qd))])
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError) as error:
+        raise ValueError(f"{rule}; it fails: {error}") from error
+    if whole.shape != qd.shape:
+        raise ValueError(f"{rule}; it gives shape {tuple(whole.shape)} for {tuple(qd.shape)}.")
+    if not torch.allclose(whole, alone, equal_nan=True):
+        raise ValueError(f"{rule}; its values for one sample depend on the other samples.")
+
+
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
     """Raise a ValueError that names joints which never move: no network can follow them."""
-    still = [plant.joint_names[j] for j in np.flatnonzero(_ranges(joint) == 0)]
+    still = [plant.joint_names[j] for j in np.flatnonzero(ranges(joint) == 0)]
     if still:
         raise ValueError(
             f"{', '.join(still)} never moves in {', '.join(r.name or 'a recording' for r in joint)}"
@@ -427,7 +458,7 @@ def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
         )
 
 
-def _ranges(joint: Sequence[Recording]) -> Array:
+def ranges(joint: Sequence[Recording] | Sequence[Motion]) -> Array:
     """Range of each joint in the recording in which it moves most, (joint,)."""
     ranges = np.max([np.ptp(r.q, axis=0) for r in joint], axis=0)
     # The difference of two absolute angles that turn together is only rounding.
@@ -441,7 +472,7 @@ def _still_joints(
     # A joint without a visible count is not compared with one.
     seen, known = np.fmin.reduce([count_seen(r.q) for r in given]), plant.position_quantum
     count = seen if known is None else np.full(plant.joints, known)
-    for name, extent, one in zip(plant.joint_names, _ranges(joint), count, strict=True):
+    for name, extent, one in zip(plant.joint_names, ranges(joint), count, strict=True):
         if extent == 0:
             yield f"{name} never moves: its friction is not observable."
         elif extent < min_counts * one:
@@ -469,13 +500,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
     """Single samples far from both neighbours, on the same side, and permanent jumps."""
     for recording in recordings:
         q, time = recording.q, recording.time
-        before, after = q[1:-1] - q[:-2], q[1:-1] - q[2:]
-        near, other = np.sort(np.abs([before, after]), axis=0)
-        # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
-        height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
-        curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
-        # A joint may show no count.
-        far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
+        far, least = _far_samples(q, options)
         # Steps far above both adjacent steps, which are similar; across a gap any step is possible.
         steps, heights = np.diff(q, axis=0), []
         steps[gaps(time)] = np.nan
@@ -485,7 +510,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
             high = np.minimum(np.abs(at - before), np.abs(at - after))
             heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
         height = np.minimum(*heights)
-        lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
+        lasting = height > least
         for name, peak, jump, high in zip(recording.names, far.T, lasting.T, height.T, strict=True):
             of = f"{recording.name or 'A recording'}: {name} jumps"
             if peak.any():
@@ -502,6 +527,50 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
             yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
+
+
+def _far_samples(x: Array, options: FitOptions) -> tuple[NDArray[np.bool_], Array]:
+    """True where an inner sample is far from both neighbours, and the least such distance."""
+    before, after = x[1:-1] - x[:-2], x[1:-1] - x[2:]
+    near, other = np.sort(np.abs([before, after]), axis=0)
+    # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
+    height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
+    curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
+    # A joint may show no count.
+    least = options.spike_ratio * np.fmax(curved, count_seen(x))
+    return height > least, least
+
+
+def _torque_spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
+    """Single samples of torque far from both neighbours."""
+    for recording in recordings:
+        if recording.tau is None:
+            continue
+        far, _ = _far_samples(recording.tau, options)
+        for name, peak in zip(recording.names, far.T, strict=True):
+            if peak.any():
+                yield (
+                    f"{recording.name or 'A recording'}: the torque of {name} jumps for one sample "
+                    f"at {_times(recording.time[1:-1][peak])}; if these are errors of the log, "
+                    "interpolate them: a simulation adds them up, whatever the loss."
+                )
+
+
+def _velocities(joint: Sequence[Recording], motions: Sequence[Motion]) -> Iterator[str]:
+    """Measured velocities that are not the derivative of the positions."""
+    for recording, motion in zip(joint, motions, strict=True):
+        if recording.qd is None or len(motion.qd) != len(recording):
+            continue
+        moved = np.square(motion.qd).sum(axis=0)
+        ratios = (recording.qd * motion.qd).sum(axis=0) / np.where(moved > 0, moved, np.nan)
+        for name, ratio in zip(recording.names, ratios, strict=True):
+            # As for counts: filters change less, units and signs more.
+            if ratio > 1.5 or ratio < 1 / 1.5:
+                yield (
+                    f"{recording.name or 'A recording'}: the velocity of {name} is {ratio:.3g} "
+                    "times the derivative of its position; check units and signs of both (fits use "
+                    "only the position)."
+                )
 
 
 def _times(found: Array) -> str:

@@ -2,6 +2,7 @@
 
 import html
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pkgutil import resolve_name
@@ -184,7 +185,9 @@ class FitResult:
         if not self.converged:
             reasons.append("the search did not converge")
         if self.unmodelled:
-            reasons.append("friction changes, a gear has play or there is a delay, see warnings")
+            # Its first clause.
+            why = re.split(r"[.,:;] | \(", self.unmodelled[0])[0]
+            reasons.append(f"{why[0].lower()}{why[1:]}, see warnings")
         if wrong:
             reasons.append(far)
         # Terms of the rig do not count: a motion may depend only on their sum (link and rotor).

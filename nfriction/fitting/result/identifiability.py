@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
+from nfriction.friction.laws import Law
 from nfriction.friction.memory import load_at_rest
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import scaled_spectrum
@@ -106,11 +107,25 @@ def standard_deviations(known: Information) -> Tensor:
 
 
 def confidence_intervals(
-    names: Sequence[str], values: Tensor, sd: Tensor, lower: Tensor, upper: Tensor
+    names: Sequence[str],
+    values: Tensor,
+    sd: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    law: Law | None = None,
 ) -> tuple[Interval, ...]:
-    """95 % confidence intervals within the bounds."""
-    low = torch.maximum(values - NORMAL_95 * sd, lower)
-    high = torch.minimum(values + NORMAL_95 * sd, upper)
+    """95 % confidence intervals within the bounds.
+
+    Positive coefficients in which the torque of the `law` is not linear are scales, such as the
+    Stribeck velocity: their logarithms are nearly normal, they themselves are not.
+    """
+    own = law.coefficients if law else ()
+    scales = {c.name for c in own if c.positive and not c.linear}
+    is_scale = torch.tensor([name.split(" of ")[0] in scales for name in names], dtype=torch.bool)
+    factor = torch.exp(NORMAL_95 * sd / values)
+    low = torch.where(is_scale, values / factor, values - NORMAL_95 * sd)
+    high = torch.where(is_scale, values * factor, values + NORMAL_95 * sd)
+    low, high = torch.maximum(low, lower), torch.minimum(high, upper)
     rows = zip(names, values.tolist(), low.tolist(), high.tolist(), strict=True)
     return tuple(Interval(*row) for row in rows)
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.data.inputs import ranges
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.result import identifiability
 from nfriction.fitting.result.fit_result import FitResult
@@ -19,6 +20,7 @@ from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
+from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 BLURRED = (
@@ -58,8 +60,10 @@ def result_from_equation_error(
         for mask in (low | high, low & (lower.abs() <= NOTHING))
     )
     unidentifiable = identifiability.null_directions(fitted_names, known)
+    unidentifiable += _of_resting(fitted_names, plant, motions)
     weak = identifiability.weakly_identified(fitted_names, values, known)
     unidentifiable += tuple(name for name in weak if not any(name in d for d in unidentifiable))
+    unidentifiable = tuple(dict.fromkeys(unidentifiable))
     found = identifiability.warnings_of(
         converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
     )
@@ -74,7 +78,9 @@ def result_from_equation_error(
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
-        intervals=identifiability.confidence_intervals(fitted_names, values, sd, lower, upper),
+        intervals=identifiability.confidence_intervals(
+            fitted_names, values, sd, lower, upper, model.law
+        ),
         unidentifiable=unidentifiable,
         warnings=(*found, BLURRED, *outlier_warning(torque.outliers)),
         outliers=torque.outliers,
@@ -107,6 +113,7 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, at_lower & least, at_upper)
     )
+    ambiguous = (*ambiguous, *_of_resting(names, plant, problem.windows.recordings))
     residuals = problem.errors(x)
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())
@@ -116,6 +123,11 @@ def result_from_shooting(
     intervals, unidentifiable, root = _identifiability(
         problem, result, names, residuals * weights, motions, ambiguous
     )
+    ends = {name: (float(a), float(b)) for name, a, b in zip(names, lower, upper, strict=True)}
+    # Their bound is a matter of chance.
+    vague = {i.name for i in intervals if i.low <= ends[i.name][0] and i.high >= ends[i.name][1]}
+    favoured = [name for name in at_bounds if name not in vague]
+    scaled = scale_warning(problem, intervals)
     mistakes = lossless_motion(problem, at_zero) if residual > limit * noise else ()
     return FitResult(
         model=model.requires_grad_(False),
@@ -133,21 +145,34 @@ def result_from_shooting(
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
         mistakes=mistakes,
+        unmodelled=scaled,
         warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)
         + identifiability.warnings_of(
-            converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
+            converged=result.converged, at_bounds=favoured, unidentifiable=unidentifiable,
             at_zero=at_zero,
         )
         + identifiability.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
-        + scale_warning(problem, intervals)
-        + rotor_warning(problem, at_bounds, at_most)
+        + (scaled or (PROPORTIONAL,) * (not problem.windows.tau.any()))
+        + rotor_warning(problem, favoured, [name for name in at_most if name in favoured])
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
         outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
+
+
+def _of_resting(
+    names: Sequence[str], plant: Plant, moved: Sequence[Recording] | Sequence[Motion]
+) -> tuple[str, ...]:
+    """Coefficients of joints that never move.
+
+    The smoothed sign creeps in simulations, which looks like information.
+    """
+    still = np.flatnonzero(ranges(moved) == 0) if moved else ()
+    ends = tuple(f" of {plant.joint_names[j]}" for j in still)
+    return tuple(name for name in names if ends and name.endswith(ends))
 
 
 def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[str, ...]:
@@ -164,11 +189,9 @@ def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[s
 
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """A sentence if a driven rig seems heavier or lighter, or if no torque shows its scale."""
-    if not problem.windows.tau.any():
-        return (PROPORTIONAL,)
+    """A sentence if a driven rig seems heavier or lighter as a whole."""
     found = list(_relative_weights(problem.jacobian.plant, intervals))
-    if len(found) < 2:
+    if len(found) < 2 or not problem.windows.tau.any():
         return ()
     scale = sum(found) / len(found)
     # Like a delay, a scale matters if it takes a coefficient of torque out of its interval.
@@ -319,14 +342,15 @@ def _identifiability(
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
     intervals = identifiability.confidence_intervals(
-        [names[i] for i in shown.tolist()], result.x[shown], sd[shown], lower[shown], upper[shown]
-    )
+        [names[i] for i in shown.tolist()], result.x[shown], sd[shown], lower[shown], upper[shown],
+        problem.friction.law,
+    )  # fmt: skip
     unidentifiable: tuple[str, ...] = ()
     if constant:
         friction = fitted[fitted < friction_count]
         coefficients = fitted_names[: len(friction)]
         unidentifiable = identifiability.null_directions(fitted_names, known, options)
-        unidentifiable += tuple(ambiguous)
+        unidentifiable = tuple(dict.fromkeys((*unidentifiable, *ambiguous)))
         slope, need = _torque_scale(problem, result, motions)
         weak = (
             *identifiability.weakly_identified(coefficients, result.x[friction], known, options),

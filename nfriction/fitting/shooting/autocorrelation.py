@@ -22,15 +22,18 @@ def correlation_time(residuals: Tensor) -> float:
     return float(_integrated(_autocovariance(centred).sum((0, 2))[None, :, None]))
 
 
-def white_noise(values: Tensor) -> Tensor:
+def white_noise(values: Tensor, weight: Tensor | None = None) -> Tensor:
     """Standard deviation of the noise in signals (window, sample, joint) by joint, (joint,).
 
     From the median of third differences, which steps and kinks of the signal do not raise; zero for
-    a signal that is held over several samples.
+    a signal that is held over several samples. Where the `weight` is 0, (window, sample), samples
+    are padding.
     """
-    if values.shape[1] < 4:
-        return torch.zeros_like(values[0, 0])
     size = torch.diff(values, n=3, dim=1).abs().flatten(0, 1)
+    if weight is not None:
+        size = size[weight[:, 3:].flatten() > 0]
+    if not len(size):
+        return torch.zeros_like(values[0, 0])
     return size.median(0).values / (NORMAL_MEDIAN * GAIN)
 
 

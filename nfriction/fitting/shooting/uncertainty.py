@@ -7,11 +7,13 @@ for many samples is not included, since it looks like an error of the law.
 """
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.result.identifiability import Information, information, observed_count
@@ -21,6 +23,7 @@ from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.inputs import has_input
 from nfriction.optim.least_squares import LeastSquaresResult
+from nfriction.recording import Recording
 
 # Counts per turn of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
@@ -70,7 +73,8 @@ def measurement_noise(
     if residual <= (enough or problem.options.model_error_ratio) * least:
         return least
     errors = problem.errors(x)
-    encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
+    noise = white_noise(errors, problem.windows.weight)
+    encoder = float(noise.clamp(min=least).square().mean().sqrt())
     response = torque_response(problem, x, 1)
     by_torque = 0.0 if response is None else _once_fitted(problem, x, response[..., 0])
     return math.hypot(encoder, by_torque)
@@ -136,6 +140,12 @@ def gathered_information(
     return information(data + torch.diag(prior), prior, shared, score)
 
 
+def torque_noise(recordings: Sequence[Recording]) -> list[NDArray[np.float64]]:
+    """Standard deviation of the noise of each recording's torques, (joint,) each [N m; N]."""
+    taus = (np.zeros_like(r.q) if r.tau is None else r.tau for r in recordings)
+    return [white_noise(torch.tensor(tau)[None]).numpy() for tau in taus]
+
+
 def torque_response(
     problem: ShootingProblem, x: Tensor, draws: int, seed: int = 0
 ) -> Tensor | None:
@@ -145,15 +155,16 @@ def torque_response(
     without noise or recordings. An error in a torque changes all later samples, so these errors
     persist. Draws whose simulation diverges are left out.
     """
-    sd = white_noise(problem.windows.tau).numpy()
-    if not (problem.windows.recordings and sd.any()):
+    recorded = problem.windows.recordings
+    sds = torque_noise(recorded)
+    if not any(sd.any() for sd in sds):
         return None
     random = np.random.default_rng(seed)
     exact, found = _positions(problem, x), []
     for _ in range(draws):
         recordings = tuple(
             r._replace(tau=r.torque_at(r.time) + SMALL * sd * random.standard_normal(r.q.shape))
-            for r in problem.windows.recordings
+            for r, sd in zip(recorded, sds, strict=True)
         )
         noisy = replace(problem.windows, recordings=recordings)
         noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])

@@ -22,11 +22,14 @@ from nfriction.fitting.shooting.autocorrelation import (
     bandwidth,
     effective_noise,
     hac_sd,
-    white_noise,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.uncertainty import explained, gathered_information
+from nfriction.fitting.shooting.uncertainty import (
+    explained,
+    gathered_information,
+    torque_noise,
+)
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
@@ -374,7 +377,7 @@ def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
     friction at all.
     """
     same = found.problem.windows.spans == before.problem.windows.spans
-    noisy = bool(white_noise(found.problem.windows.tau).any())
+    noisy = any(sd.any() for sd in torque_noise(found.problem.windows.recordings))
     if same or not noisy or not before.explained:
         return False
     return _log_volume(found) > _log_volume(before)

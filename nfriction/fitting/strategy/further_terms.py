@@ -60,7 +60,9 @@ def delay_warning(
     values = dict(zip(names, late.parts.friction.tolist(), strict=True))
     own = [(i, values[i.name]) for i in intervals if i.name in values]
     left = ", ".join(f"{i.name} {x:.3g}" for i, x in own if not i.low <= x <= i.high)
-    where = f"leave their intervals: {left}" if left else "stay within their intervals"
+    # Only the nearest minimum was sought.
+    stay = "stay within their intervals unless `fit_delay` finds another minimum"
+    where = f"leave their intervals: {left}" if left else stay
     delay = delay_in_words(float(late.parts.plant[-1]))
     return [LATE.format(delay, fall, where)], bool(left)
 

@@ -234,8 +234,8 @@ def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:
     if path is None or not path.exists():
         return {}
     content = parse_json(path.read_bytes())
-    if content["options"] != _described(options):
-        raise ValueError(f"{path}: made with other options; repeat them or take another file.")
+    if not isinstance(content, dict) or content.get("options") != _described(options):
+        raise ValueError(f"{path}: no checkpoint of these options; repeat them or name a new file.")
     return {price: (done, np.array(rows)) for price, (done, rows) in content["found"].items()}
 
 

@@ -69,7 +69,7 @@ def test_a_resumed_evolution_is_the_whole_one(tmp_path: Path) -> None:
     )  # fmt: skip
     assert [g for _, g in seen] == [2, 3, 2, 3]
     assert [c.controller.rule_base for c in again] == [c.controller.rule_base for c in whole]
-    with pytest.raises(ValueError, match="other options"):
+    with pytest.raises(ValueError, match="no checkpoint of these options"):
         evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=replace(half, seed=7))
 
 
