@@ -707,7 +707,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[str]:
-    """A sentence for each joint whose friction grows or falls, during recordings or between them.
+    """A sentence for each joint whose friction changes, during recordings or between them.
 
     For the arguments see `likely_mistakes`. A wrong law, rig or delay must not appear as a change:
     friction may be any function of speed plus a share of the torque, and the rig is fitted as well.
@@ -726,8 +726,18 @@ def changing_friction(
         terms = [x[sliding] for x in means]
         if (count := len(terms[0])) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
-        piece = torch.arange(count) * pieces // count
-        for period, shapes in clocks.items():
+        piece, periods = torch.arange(count) * pieces // count, clocks
+        if len(recordings) > 2:
+            # The recording whose friction differs most from that of the others.
+            alone = [(number == k).to(number) for k in range(len(recordings))]
+            friction, of_rig, torque = terms
+            rates_alone = [
+                _growth(piece < 0, friction, of_rig, torque, one[sliding])[0] for one in alone
+            ]
+            odd = int(np.argmax(np.abs(rates_alone)))
+            name = recordings[odd].name or f"recording {odd + 1}"
+            periods = clocks | {f"in {name} relative to the others": (alone[odd],)}
+        for period, shapes in periods.items():
             tried = []
             # Per time of sliding, in pieces that all contain some: rest shows nothing.
             for clock in (shape[sliding] for shape in shapes):

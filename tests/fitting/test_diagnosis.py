@@ -208,6 +208,30 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
+@pytest.mark.parametrize("change", [0.0, 0.3])
+def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(change):
+    """With another motion in each."""
+    recordings, rng = [], np.random.default_rng(0)
+    time = 0.004 * np.arange(2001)[:, None]
+    for number, rate in enumerate((1.3, 1.7, 2.3, 1.9)):
+        wave = np.array([rate, 0.53 * rate])
+        q, qd, qdd = (
+            0.1 * (wave**k * np.sin(wave * time + 0.5 * k * math.pi)).sum(1, keepdims=True)
+            for k in range(3)
+        )
+        factor = 1 + change * (number == 2)
+        tau = 3.5 * qdd + factor * (12 * np.sign(qd) + 15 * qd) + 0.1 * rng.normal(size=q.shape)
+        q = q + 1e-5 * rng.normal(size=q.shape)
+        recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
+    motions = [kalman_smoother(r.time, r.q) for r in recordings]
+    said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
+    assert len(said) == (change > 0)
+    for sentence in said:
+        found = re.search(r"grows by (\S+) % \(within \S+ %\) in run2 relative to", sentence)
+        # Changes are reported as if exponential around the mean of all recordings.
+        assert float(found[1]) == pytest.approx(30, abs=4)
+
+
 @pytest.mark.parametrize("chirp", [True, False])
 @pytest.mark.parametrize("mass", [1.0, 1.1])
 def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp, mass):
