@@ -84,8 +84,9 @@ def _pow(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
     a, b = node.args
     terms = []
     if da is not None:
-        lower = g.apply("pow", a, g.apply("sub", b, g.constant(1.0)))
-        terms.append(g.apply("mul", da, g.apply("mul", b, lower)))
+        lower = g.apply("mul", b, g.apply("pow", a, g.apply("sub", b, g.constant(1.0))))
+        zero = g.constant(0.0)
+        terms.append(g.apply("mul", da, g.apply("where", g.apply("eq", b, zero), zero, lower)))
     if db is not None:
         zero, rise = g.constant(0.0), g.apply("mul", node, g.apply("log", a))
         # At 0 the power stays 0, while the logarithm is infinite.

@@ -259,17 +259,19 @@ class Comparison:
         """Models not to be used, with the reason: one no larger predicts the test far better.
 
         A model extrapolates wrongly if no friction, or with half its error a model with no more
-        parameters, is better by more than the limit of these data. Any larger error is unfit, too,
-        unless noise alone can cause it: near sticking, the law of the rig itself may err by far.
+        parameters, is better by more than the limit of these data. Any larger error is unfit, too.
+        An error that noise can cause is no evidence, unless noise can cause as much without
+        friction: near sticking, the law of the rig itself may err by far.
         """
         if not self.test:
             return {}
         rmse, limit = self.table()["all"], self.limit() or 0.0
         found, excused = {}, [NO_FRICTION]
+        largest = rmse.get(NO_FRICTION, 0.0)
         for name, error in rmse.items():
             smaller = rmse[[self._parameters(n) <= self._parameters(str(name)) for n in rmse.index]]
             least = smaller.min()
-            if error <= (self.limit(model=str(name)) or 0.0):
+            if error <= (self.limit(model=str(name)) or 0.0) < largest:
                 excused.append(str(name))
             # Where all of these diverge, none is known to be better.
             elif np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:

@@ -22,7 +22,7 @@ from nfriction.evaluation.parallel import Progress, as_completed, check_jobs
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import Usability
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
+from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording
 
 if TYPE_CHECKING:
@@ -149,11 +149,12 @@ def fit_sessions(
         )
         for name in names
     )
-    # The first spreads are those of the coefficients, in the order of the parameter vector.
-    mean = copy.deepcopy(model)
-    count = mean.schedule.parameter_vector().numel()
-    vector = torch.tensor([s.mean for s in spreads[:count]], dtype=torch.float64)
-    mean.schedule.set_parameter_vector(torch.where(vector.isnan(), 0.0, vector))
+    # Coefficients that are not fitted stay as they are.
+    mean, means = copy.deepcopy(model), {s.name: s.mean for s in spreads}
+    own = mean.schedule.parameter_vector().tolist()
+    labels = mean.schedule.parameter_names(rigs.of(plant).joint_names)
+    vector = [means.get(name, x) for name, x in zip(labels, own, strict=True)]
+    mean.schedule.set_parameter_vector(torch.tensor(vector, dtype=torch.float64).nan_to_num(0.0))
     return SessionsResult(mean.requires_grad_(False), spreads, fits, failed)
 
 

@@ -719,28 +719,26 @@ def changing_friction(
         return
     time, number = data.mean(data.time), data.mean(data.number.to(data.time))
     # At a constant rate, or as a warm-up of which 95 % is over at the end.
-    during = time, 1 - torch.exp(-3 * time / time.max())
-    clocks = {"during a recording": during, "from the first recording to the last": (number,)}
+    during = [("during a recording", x) for x in (time, 1 - torch.exp(-3 * time / time.max()))]
+    onward = "from the first recording to the last", number
     for j in range(plant.joints):
         *means, sliding = _of_sliding(plant, data, j, options)
-        terms = [x[sliding] for x in means]
-        if (count := len(terms[0])) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
+        friction, of_rig, torque = terms = [x[sliding] for x in means]
+        if (count := len(friction)) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
-        piece, periods = torch.arange(count) * pieces // count, clocks
+        piece, between = torch.arange(count) * pieces // count, [onward]
         if len(recordings) > 2:
             # The recording whose friction differs most from that of the others.
             alone = [(number == k).to(number) for k in range(len(recordings))]
-            friction, of_rig, torque = terms
-            rates_alone = [
-                _growth(piece < 0, friction, of_rig, torque, one[sliding])[0] for one in alone
-            ]
-            odd = int(np.argmax(np.abs(rates_alone)))
+            own = [_growth(piece < 0, friction, of_rig, torque, x[sliding])[0] for x in alone]
+            odd = int(np.argmax(np.abs(own)))
             name = recordings[odd].name or f"recording {odd + 1}"
-            periods = clocks | {f"in {name} relative to the others": (alone[odd],)}
-        for period, shapes in periods.items():
+            between.append((f"in {name} relative to the others", alone[odd]))
+        for clocks in (during, between):
             tried = []
             # Per time of sliding, in pieces that all contain some: rest shows nothing.
-            for clock in (shape[sliding] for shape in shapes):
+            for period, whole in clocks:
+                clock = whole[sliding]
                 span = clock.max() - clock.min()
                 if span == 0:
                     continue
@@ -748,17 +746,24 @@ def changing_friction(
                 found = [_growth(piece == k, *given) for k in range(pieces)]
                 rates, squares = zip(*found, strict=True)
                 constant, growing = torch.stack(squares).T
-                tried.append((growing, constant, np.var(rates), _growth(piece < 0, *given)[0]))
+                mean = float((clock - clock.min()).mean() / span)
+                change = _growth(piece < 0, *given)[0]
+                tried.append((growing, constant, np.var(rates), change, mean, period))
             if not tried:
                 continue
-            growing, constant, variance, rate = min(tried, key=lambda x: float(x[0].sum()))
+            best = min(tried, key=lambda x: float(x[0].sum()))
+            growing, constant, variance, rate, mean, period = best
             sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
             if abs(rate) > least and gains(growing, constant, options.drift_chance):
-                # From start to end as if exponential, so that no friction falls by over 100 %.
-                sd *= np.exp(rate) * student_quantile(pieces - 1, 0.975)
-                change, reach = (float(f"{100 * x:.2g}") for x in (abs(np.expm1(rate)), sd))
+                first, last = 1 - rate * mean, 1 + rate * (1 - mean)
+                ratio, slope = last / first, (1 - mean) / last + mean / first
+                if not (first > 0 and last > 0):
+                    # As if exponential, so that no friction falls by over 100 %.
+                    ratio, slope = math.exp(rate), 1.0
+                sd *= ratio * slope * student_quantile(pieces - 1, 0.975)
+                change, reach = (float(f"{100 * x:.2g}") for x in (abs(ratio - 1), sd))
                 yield (
                     f"The friction of {plant.joint_names[j]} {'grows' if rate > 0 else 'falls'} by "
                     f"{change:g} % (within {reach:g} %) {period} (warm-up, payload); the intervals "

@@ -401,7 +401,7 @@ def _design(
     design = torch.stack([*columns, without], -1)
     for sample, joint, k in (~torch.isfinite(design)).nonzero()[:1].tolist():
         ones = [f"{law.names[i]} is 1" for i in others]
-        unit_of = [*ones, "its coefficients are 0"][k]
+        unit_of = [*ones, "its linear coefficients are 0"][k]
         raise ValueError(
             f"law {law.name!r} gives {float(design[sample, joint, k]):g} where {unit_of}, at joint "
             f"{joint + 1}, velocity {float(qd[sample, joint]):g} and load "

@@ -61,7 +61,7 @@ def prepare_task(
     # Checked before much time is spent on recordings.
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
-    inputs.require_elementwise(model.law)
+    inputs.require_elementwise(model.law, model.joints)
     if plant.has_position_load and not has_input(model.law, "position"):
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)

@@ -210,7 +210,13 @@ def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> i
     Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. The fastest mode decays at
     the largest eigenvalue lambda of M^-1 D, over all poses, so h lambda must stay below 2.785.
     """
-    rate = plant.decay_rate(friction.zero_velocity_damping())
+    damping = friction.zero_velocity_damping()
+    if not torch.isfinite(damping).all():
+        raise ValueError(
+            f"the slope of friction at rest must be finite, got {damping.tolist()}; in place of "
+            "speed**n with n < 1 use (speed**2 + small)**(n / 2)."
+        )
+    rate = plant.decay_rate(damping)
     return max(1, int(torch.ceil(rate.max() * (sample_time / RK4_STABILITY * (1 - 1e-9)))))
 
 

@@ -350,6 +350,9 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     sensitive.test["LFM"] = scored(found, 3.0, **errors).test["LFM"]
     assert set(scored(found, 0.1, **errors).unfit()) == {"LFM"}
     assert sensitive.unfit() == {}
+    # In chaotic motion any law is as sensitive.
+    sensitive.test["LFM"] = scored(found, 9.5, **errors).test["LFM"]
+    assert set(sensitive.unfit()) == {"LFM"}
     assert dataclasses.replace(found, test={}).unfit() == {}
 
 

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, NFCVFM, LinearAxis, PendulumChain, Recording, fit_sessions, rollout
+from nfriction import (
+    CVFM,
+    NFCVFM,
+    LinearAxis,
+    PendulumChain,
+    Recording,
+    Stribeck,
+    fit_sessions,
+    rollout,
+)
 from nfriction.evaluation.sessions import random_effects
 from nfriction.friction.memory import Dahl
 
@@ -101,6 +110,19 @@ def test_a_parameter_that_few_sessions_determine_has_no_interval():
     found = random_effects("x", np.ones(5), np.array([0.1, 0.1, *[math.inf] * 3]))
     assert math.isnan(found.mean)
     assert (found.next_low, found.next_high) == (-math.inf, math.inf)
+
+
+def test_coefficients_that_are_not_fitted_stay_in_the_mean_model():
+    rng, sessions = np.random.default_rng(0), {}
+    for k in range(3):
+        one = session(np.array([0.02, 0.006]) * (1 + 0.1 * rng.normal(size=2)))
+        sessions[f"day {k}"] = one
+    model = Stribeck(1, [[0.02, 0.0, 0.006, 0.3, 1.5]], v_smooth=0.05)
+    found = fit_sessions(model, PLANT, sessions, windows=(0.5,), drag=False)
+    values = found.model.schedule.coefficient_sets()["always"][0]
+    assert float(values[4]) == 1.5
+    means = {s.name: s.mean for s in found.spreads}
+    assert float(values[2]) == pytest.approx(means["F_v of joint1"])
 
 
 def test_a_session_whose_fit_is_not_to_be_used_does_not_count():

@@ -227,9 +227,9 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(cha
     said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
     assert len(said) == (change > 0)
     for sentence in said:
-        found = re.search(r"grows by (\S+) % \(within \S+ %\) in run2 relative to", sentence)
-        # Changes are reported as if exponential around the mean of all recordings.
-        assert float(found[1]) == pytest.approx(30, abs=4)
+        named = re.search(r"grows by (\S+) % \(within (\S+) %\) in run2 relative to", sentence)
+        found, within = map(float, named.groups())
+        assert abs(found - 30) < within < 5
 
 
 @pytest.mark.parametrize("chirp", [True, False])
@@ -717,7 +717,8 @@ def assert_drift(said: tuple[str, ...], factors: dict[str, float]) -> None:
     assert len(said) == len(factors)
     for sentence, (joint, factor) in zip(said, factors.items(), strict=True):
         way, found, within = re.match(
-            rf"The friction of {joint} (grows|falls) by (\S+) % \(within (\S+) %\) .* to the last",
+            rf"The friction of {joint} (grows|falls) by (\S+) % \(within (\S+) %\) "
+            "(?:.* to the last|in other)",
             sentence,
         ).groups()
         assert way == ("grows" if factor > 1 else "falls")

@@ -1,5 +1,7 @@
 """The torque fit is exact on exact torques, and least squares within bounds otherwise."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -205,7 +207,9 @@ def test_coefficients_that_are_not_fitted_keep_the_values_of_the_model():
         (lambda qd, c: c[..., 0] * qd if qd > 0 else 0.0 * qd, "it fails: "),
         (lambda qd, c: torch.tanh(qd), "it fails: "),
         (lambda qd, c: (c[..., 0] * qd).sum(-1), r"it gives shape \(3,\) for \(3, 2\)"),
-        (lambda qd, c: c[..., 0] * (qd - qd.mean()), "depend on the other samples"),
+        (lambda qd, c: c[..., 0] * math.tanh(qd), "it fails: "),
+        (lambda qd, c: c[..., 0] * (qd - qd.mean(0)), "depend on the other samples"),
+        (lambda qd, c: c[..., 0] * qd.sum(-1, keepdim=True), "depend on the first joint"),
     ],
 )  # fmt: skip
 def test_a_law_that_is_not_elementwise_is_refused_by_name(torque, message):
@@ -213,4 +217,4 @@ def test_a_law_that_is_not_elementwise_is_refused_by_name(torque, message):
         return torque(qd, coefficients)
 
     with pytest.raises(ValueError, match=f"law 'mine' must be an elementwise.*{message}"):
-        require_elementwise(Law("mine", (Coefficient("F_c", "N m"),), law))
+        require_elementwise(Law("mine", (Coefficient("F_c", "N m"),), law), 2)

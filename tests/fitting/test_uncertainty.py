@@ -16,7 +16,7 @@ from nfriction.fitting.result.identifiability import (
 from nfriction.fitting.shooting import uncertainty
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.uncertainty import torque_response
+from nfriction.fitting.shooting.uncertainty import torque_noise, torque_response
 from nfriction.fitting.strategy.neurofuzzy import Validation
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import flywheel
@@ -196,3 +196,16 @@ def test_a_network_that_is_not_kept_is_as_sure_as_its_law(fits):
     kept = replace(law, model=found.model)  # as a fit does where the network predicts worse
     rest = torch.zeros(3, 1, dtype=F64)
     torch.testing.assert_close(kept.uncertainty.sd(rest, rest), law.uncertainty.sd(rest, rest))
+
+
+def test_the_noise_of_torques_does_not_depend_on_other_recordings():
+    """Windows of a low sample rate, or of a recording without torque, are padded or zero."""
+    random, made = np.random.default_rng(0), []
+    for step, noise in ((1e-3, 0.02), (4e-3, 0.05), (1e-3, None)):
+        time = step * np.arange(round(4.0 / step))
+        q = np.sin(3.0 * time)[:, None]
+        tau = None if noise is None else 0.5 * q + noise * random.normal(size=q.shape)
+        made.append(Recording(time, q, tau, convention="relative,upright"))
+    motions = [kalman_smoother(r.time, r.q) for r in made]
+    found = torque_noise(cut_windows(made, motions, 0.5))
+    assert np.concatenate(found) == pytest.approx([0.02, 0.05, 0.0], rel=0.1)

@@ -420,16 +420,16 @@ def finer_counts(plant: Plant, given: Sequence[Recording]) -> Iterator[str]:
         )
 
 
-def require_elementwise(law: Law) -> None:
+def require_elementwise(law: Law, joints: int) -> None:
     """Raise ValueError unless the torque is elementwise and consists of torch operations."""
-    qd = torch.tensor([[0.5, -1.5], [0.0, 2.0], [-0.1, 0.3]], dtype=torch.float64)
+    qd = torch.linspace(-1.5, 2.0, 3 * joints, dtype=torch.float64).reshape(3, joints)
     coefficients = torch.full((*qd.shape, len(law.names)), 0.5, dtype=torch.float64)
     rule = (
         f"the torque of law {law.name!r} must be an elementwise function of torch operations, of "
         "velocity and load (*batch, joint) and coefficients (*batch, joint, coefficient)"
     )
 
-    def torque(rows: slice) -> Tensor:
+    def torque(rows: slice, qd: Tensor = qd) -> Tensor:
         return law.torque(qd[rows], torch.ones_like(qd[rows]), coefficients[rows], 1e-3)
 
     try:
@@ -440,12 +440,16 @@ def require_elementwise(law: Law) -> None:
             whole = torque(slice(None))
             torch.autograd.grad(whole.sum(), coefficients)
         alone = torch.cat([torque(slice(k, k + 1)) for k in range(len(qd))])
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError) as error:
+        others = torque(slice(None), qd + torch.eye(1, joints))[..., 1:]
+    except (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError,
+            ValueError) as error:  # fmt: skip
         raise ValueError(f"{rule}; it fails: {error}") from error
     if whole.shape != qd.shape:
         raise ValueError(f"{rule}; it gives shape {tuple(whole.shape)} for {tuple(qd.shape)}.")
     if not torch.allclose(whole, alone, equal_nan=True):
         raise ValueError(f"{rule}; its values for one sample depend on the other samples.")
+    if not torch.allclose(whole[..., 1:], others, equal_nan=True):
+        raise ValueError(f"{rule}; its values for one joint depend on the first joint.")
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
@@ -561,11 +565,14 @@ def _velocities(joint: Sequence[Recording], motions: Sequence[Motion]) -> Iterat
     for recording, motion in zip(joint, motions, strict=True):
         if recording.qd is None or len(motion.qd) != len(recording):
             continue
-        moved = np.square(motion.qd).sum(axis=0)
-        ratios = (recording.qd * motion.qd).sum(axis=0) / np.where(moved > 0, moved, np.nan)
-        for name, ratio in zip(recording.names, ratios, strict=True):
-            # As for counts: filters change less, units and signs more.
-            if ratio > 1.5 or ratio < 1 / 1.5:
+        moved, both, measured = (
+            (a * b).sum(axis=0)
+            for a, b in pairwise((motion.qd, motion.qd, recording.qd, recording.qd))
+        )
+        for name, v, vw, w in zip(recording.names, moved, both, measured, strict=True):
+            ratio = vw / v if v > 0 else 1.0
+            # As for counts: filters change less, units and signs more. Noise is not proportional.
+            if (ratio > 1.5 or ratio < 1 / 1.5) and vw**2 > 0.5 * v * w:
                 yield (
                     f"{recording.name or 'A recording'}: the velocity of {name} is {ratio:.3g} "
                     "times the derivative of its position; check units and signs of both (fits use "

@@ -185,9 +185,10 @@ class FitResult:
         if not self.converged:
             reasons.append("the search did not converge")
         if self.unmodelled:
-            # Its first clause.
-            why = re.split(r"[.,:;] | \(", self.unmodelled[0])[0]
-            reasons.append(f"{why[0].lower()}{why[1:]}, see warnings")
+            # Their first clauses.
+            whys = [re.split(r"[.,:;] | \(", text)[0] for text in self.unmodelled]
+            clauses = "; ".join(f"{why[0].lower()}{why[1:]}" for why in whys)
+            reasons.append(f"{clauses}, see warnings")
         if wrong:
             reasons.append(far)
         # Terms of the rig do not count: a motion may depend only on their sum (link and rotor).

@@ -32,10 +32,14 @@ class Interval:
     value: float
     low: float  # at least the lower bound; infinite where the data determine nothing
     high: float  # at most the upper bound; likewise
+    multiplicative: bool = False
 
     @property
     def sd(self) -> float:
         """Standard deviation from the wider side, because a bound may clip the other."""
+        if self.multiplicative:
+            factor = max(self.high / self.value, self.value / self.low)
+            return self.value * math.log(factor) / NORMAL_95
         return max(self.high - self.value, self.value - self.low) / NORMAL_95
 
 
@@ -126,7 +130,8 @@ def confidence_intervals(
     low = torch.where(is_scale, values / factor, values - NORMAL_95 * sd)
     high = torch.where(is_scale, values * factor, values + NORMAL_95 * sd)
     low, high = torch.maximum(low, lower), torch.minimum(high, upper)
-    rows = zip(names, values.tolist(), low.tolist(), high.tolist(), strict=True)
+    columns = (x.tolist() for x in (values, low, high, is_scale))
+    rows = zip(names, *columns, strict=True)
     return tuple(Interval(*row) for row in rows)
 
 

@@ -113,7 +113,8 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, at_lower & least, at_upper)
     )
-    ambiguous = (*ambiguous, *_of_resting(names, plant, problem.windows.recordings))
+    free = [name for name, moves in zip(names, (lower < upper).tolist(), strict=True) if moves]
+    ambiguous = (*ambiguous, *_of_resting(free, plant, problem.windows.recordings))
     residuals = problem.errors(x)
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())

@@ -33,7 +33,7 @@ def white_noise(values: Tensor, weight: Tensor | None = None) -> Tensor:
     if weight is not None:
         size = size[weight[:, 3:].flatten() > 0]
     if not len(size):
-        return torch.zeros_like(values[0, 0])
+        return values.new_zeros(values.shape[-1])
     return size.median(0).values / (NORMAL_MEDIAN * GAIN)
 
 

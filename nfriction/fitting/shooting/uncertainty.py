@@ -7,7 +7,6 @@ for many samples is not included, since it looks like an error of the law.
 """
 
 import math
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.identifiability import Information, information, observed_count
 from nfriction.fitting.robust_loss import SQUARES
 from nfriction.fitting.shooting import normal_equations as normal
@@ -23,7 +23,6 @@ from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.inputs import has_input
 from nfriction.optim.least_squares import LeastSquaresResult
-from nfriction.recording import Recording
 
 # Counts per turn of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
@@ -140,10 +139,11 @@ def gathered_information(
     return information(data + torch.diag(prior), prior, shared, score)
 
 
-def torque_noise(recordings: Sequence[Recording]) -> list[NDArray[np.float64]]:
+def torque_noise(windows: Windows) -> list[NDArray[np.float64]]:
     """Standard deviation of the noise of each recording's torques, (joint,) each [N m; N]."""
-    taus = (np.zeros_like(r.q) if r.tau is None else r.tau for r in recordings)
-    return [white_noise(torch.tensor(tau)[None]).numpy() for tau in taus]
+    places = torch.tensor([place for place, *_ in windows.spans])
+    parts = [windows.subset(places == k) for k in range(len(windows.recordings))]
+    return [white_noise(part.tau, part.weight[:, 1:]).numpy() for part in parts]
 
 
 def torque_response(
@@ -156,7 +156,7 @@ def torque_response(
     persist. Draws whose simulation diverges are left out.
     """
     recorded = problem.windows.recordings
-    sds = torque_noise(recorded)
+    sds = torque_noise(problem.windows)
     if not any(sd.any() for sd in sds):
         return None
     random = np.random.default_rng(seed)

@@ -377,7 +377,7 @@ def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
     friction at all.
     """
     same = found.problem.windows.spans == before.problem.windows.spans
-    noisy = any(sd.any() for sd in torque_noise(found.problem.windows.recordings))
+    noisy = any(sd.any() for sd in torque_noise(found.problem.windows))
     if same or not noisy or not before.explained:
         return False
     return _log_volume(found) > _log_volume(before)
