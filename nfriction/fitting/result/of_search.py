@@ -156,7 +156,7 @@ def result_from_shooting(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + (scaled or (PROPORTIONAL,) * (not problem.windows.tau.any()))
-        + rotor_warning(problem, favoured, [name for name in at_most if name in favoured])
+        + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
         outliers=outliers,
