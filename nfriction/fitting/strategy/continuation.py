@@ -13,6 +13,7 @@ from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.identifiability import (
+    NORMAL_95,
     covariance_root,
     information,
     standard_deviations,
@@ -342,7 +343,7 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     bias its parameters. Even with a correct law and plant, torque noise accumulates, so longer
     windows may determine friction less well (`knows_less`). As the noise of each horizon is
     unknown, its log likelihood uses the RMS residual; a stage loses if its parameters are worse at
-    a shorter horizon by more than its noise, and gain less at their own.
+    a shorter horizon by more than its noise, and over all horizons by more than that of the sum.
     """
     from scipy.special import chdtri  # slow to import
 
@@ -352,7 +353,7 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     driven = bool(found.problem.windows.tau.any())
     if knows_less(found, before):
         return True
-    total, worse = 0.0, False
+    total, variance, worse = 0.0, 0.0, False
     for at in (*stages, found):
         new = _squares(at, found)
         if at is not found and at.explained:
@@ -365,8 +366,10 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
         old = _squares(at, before)
         ratio, spread = log_ratio(new, old)
         total += ratio
+        # A single window has no scatter.
+        variance += spread**2 if math.isfinite(spread) else 0.0
         worse |= at is not found and ratio > spread * student_quantile(len(new) - 1, 1 - chance)
-    return worse and not total <= 0
+    return worse and not total <= math.sqrt(variance) * NORMAL_95
 
 
 def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
