@@ -260,8 +260,8 @@ class Comparison:
 
         A model extrapolates wrongly if no friction, or with half its error a model with no more
         parameters, is better by more than the limit of these data. Any larger error is unfit, too.
-        An error that noise can cause is no evidence, unless noise can cause as much without
-        friction: near sticking, the law of the rig itself may err by far.
+        An error within the model's own limit is no evidence, unless that limit reaches the error
+        without friction: near sticking, the law of the rig itself may err by far.
         """
         if not self.test:
             return {}

@@ -565,14 +565,14 @@ def _velocities(joint: Sequence[Recording], motions: Sequence[Motion]) -> Iterat
     for recording, motion in zip(joint, motions, strict=True):
         if recording.qd is None or len(motion.qd) != len(recording):
             continue
-        moved, both, measured = (
-            (a * b).sum(axis=0)
-            for a, b in pairwise((motion.qd, motion.qd, recording.qd, recording.qd))
-        )
-        for name, v, vw, w in zip(recording.names, moved, both, measured, strict=True):
-            ratio = vw / v if v > 0 else 1.0
-            # As for counts: filters change less, units and signs more. Noise is not proportional.
-            if (ratio > 1.5 or ratio < 1 / 1.5) and vw**2 > 0.5 * v * w:
+        columns = zip(recording.names, motion.qd.T, recording.qd.T, strict=True)
+        for name, derived, measured in columns:
+            square, product = derived @ derived, derived @ measured
+            ratio = product / square if square > 0 else 1.0
+            # Noise of a joint at rest is not proportional to its velocity.
+            proportional = product**2 > 0.5 * square * (measured @ measured)
+            # As for counts: filters change less, units and signs more.
+            if proportional and not 1 / 1.5 <= ratio <= 1.5:
                 yield (
                     f"{recording.name or 'A recording'}: the velocity of {name} is {ratio:.3g} "
                     "times the derivative of its position; check units and signs of both (fits use "
