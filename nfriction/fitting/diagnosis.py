@@ -756,12 +756,11 @@ def changing_friction(
             sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
-            if abs(rate) > least and gains(growing, constant, options.drift_chance):
-                first, last = 1 - rate * mean, 1 + rate * (1 - mean)
+            # Friction that would change its sign is an error of the rig.
+            first, last = 1 - rate * mean, 1 + rate * (1 - mean)
+            seen = abs(rate) > least and min(first, last) > 0
+            if seen and gains(growing, constant, options.drift_chance):
                 ratio, slope = last / first, (1 - mean) / last + mean / first
-                if not (first > 0 and last > 0):
-                    # As if exponential, so that no friction falls by over 100 %.
-                    ratio, slope = math.exp(rate), 1.0
                 sd *= ratio * slope * student_quantile(pieces - 1, 0.975)
                 change, reach = (float(f"{100 * x:.2g}") for x in (abs(ratio - 1), sd))
                 yield (
