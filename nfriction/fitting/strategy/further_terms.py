@@ -49,7 +49,8 @@ def delay_warning(
     """A sentence on the torque delay that the data indicate, and whether friction depends on it.
 
     A delay below one sample is hardly visible in the torque balance. A wrong law also looks like a
-    delay; friction depends on it only if fitting it moves a coefficient out of its interval.
+    delay; friction depends on it only if fitting it moves a coefficient out of its interval, and a
+    shorter delay than one sample that moves none is not worth a sentence.
     """
     late = richer_by_evidence(found, delayed, "delay of the torque")
     fall = 0 if late is None else round(100 * (1 - late.rms / found.rms))
@@ -60,11 +61,13 @@ def delay_warning(
     values = dict(zip(names, late.parts.friction.tolist(), strict=True))
     own = [(i, values[i.name]) for i in intervals if i.name in values]
     left = ", ".join(f"{i.name} {x:.3g}" for i, x in own if not i.low <= x <= i.high)
+    lag = float(late.parts.plant[-1])
+    if not left and abs(lag) < min(r.sample_time for r in delayed.recordings):
+        return [], False
     # Only the nearest minimum was sought.
     stay = "stay within their intervals unless `fit_delay` finds another minimum"
     where = f"leave their intervals: {left}" if left else stay
-    delay = delay_in_words(float(late.parts.plant[-1]))
-    return [LATE.format(delay, fall, where)], bool(left)
+    return [LATE.format(delay_in_words(lag), fall, where)], bool(left)
 
 
 @dataclass(frozen=True)
