@@ -216,7 +216,7 @@ def driven(data: Path) -> Iterator[Row]:
 
 def tour(_: Path) -> Iterator[Row]:
     """The comparison of docs/tour.md [mrad]."""
-    return compared("demo", "--seconds", "5", "--models", "NCFM,LFM,NFNCFM", digits=4)
+    return compared("demo", "--seconds", "5", "--models", "NCFM,LFM,NFCVFM", digits=4)
 
 
 def intervals(data: Path) -> Iterator[Row]:

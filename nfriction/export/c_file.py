@@ -84,13 +84,15 @@ def c(
     plant = None if info is None or info.rig is None else from_dict(info.rig)
     code, header = source_of(controller, contract.description, dialect, name, plant)
     words = _words(contract, name)
+    # A hidden state advances by one sample in every call, also in minor steps of a solver.
+    held = contract.description["sample_time"] if controller.memory_size else None
     files = {
         f"{name}.c": code,
         f"{name}.h": header,
         f"{name}.contract.json": contract.to_json() + "\n",
         f"{name}_selftest.c": dialect.text("selftest.c", **words, **_vectors(contract, dialect)),
         f"{name}.hpp": dialect.text("wrapper.hpp", **words),
-        f"{name}_sfun.c": dialect.text("simulink.c", **words),
+        f"{name}_sfun.c": dialect.text("simulink.c", **words, held=held),
         f"{name}.ino": dialect.text("arduino.ino", **words, loaded=controller.loaded),
     }
     return [write_atomically(Path(folder) / key, text.encode("ascii"))

@@ -219,7 +219,9 @@ class Controller(nn.Module):
         qd, first, second = self._low_pass((q - q_last) / self.sample_time, first, second)
         qdd, third, fourth = self._low_pass((qd - qd_last) / self.sample_time, third, fourth)
         following = torch.stack([q, qd, first, second, third, fourth], -1)
-        following = torch.where(q.abs().unsqueeze(-1) < math.inf, following, state[..., :6])
+        # After a missing sample there is no difference yet: the low-pass filters wait for one.
+        waiting = torch.cat([q.unsqueeze(-1), state[..., 1:6]], -1)
+        following = torch.where(qdd.abs().unsqueeze(-1) < math.inf, following, waiting)
         tau_f, coefficients, status, memory = self.step(qd, qdd, load, state[..., 6:])
         if self.remembers:
             following = torch.cat([following, memory], -1)
@@ -236,8 +238,7 @@ class Controller(nn.Module):
     def filtered_start(self, q: Tensor) -> Tensor:
         """State of a filter that has rested at `q`, (*batch, joint); a reset is the same."""
         rest = torch.zeros_like(q)
-        position = torch.where(q.abs() < math.inf, q, rest)
-        state = torch.stack([position, rest, rest, rest, rest, rest], -1)
+        state = torch.stack([q, rest, rest, rest, rest, rest], -1)
         if self.remembers:
             state = torch.cat([state, self.initial_memory(rest, rest)], -1)
         return state

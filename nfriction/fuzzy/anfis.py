@@ -1,12 +1,20 @@
 """ANFIS: a Takagi-Sugeno layer with learnable memberships, with groups (joints) stacked."""
 
 import math
+import operator
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
+from nfriction.fuzzy.grouped import (
+    LinearOutputModule,
+    input_range,
+    ridge,
+    targets_of,
+    to_columns,
+    to_rows,
+)
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN, log_bell, log_gaussian
 from nfriction.fuzzy.partition import (
     FreePartition,
@@ -57,30 +65,29 @@ class Anfis(LinearOutputModule):
         order: int = 1,
         kind: str = "gaussian",
         interpretable: bool = False,
-        dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        self.terms = [int(count) for count in terms]
+        self.terms = [operator.index(count) for count in terms]
         _check_sizes(groups, inputs, self.terms, outputs, order, kind)
         self.groups, self.inputs, self.outputs, self.order = groups, inputs, outputs, order
         self.kind, self.interpretable = kind, interpretable
         self.rules = math.prod(self.terms)
-        partition: FreePartition | OrderedPartition = FreePartition(groups, self.terms, dtype)
+        partition: FreePartition | OrderedPartition = FreePartition(groups, self.terms)
         if interpretable:
             half_width = HALF_WIDTH_OF_GAUSSIAN if kind == "gaussian" else 1.0
-            partition = OrderedPartition(groups, self.terms, half_width, dtype)
+            partition = OrderedPartition(groups, self.terms, half_width)
         self.partition = partition
         sets = sum(self.terms)
         # Gaussians have no slopes; an empty parameter would trip up optimisers.
         self.log_slopes = (
-            nn.Parameter(torch.full((groups, sets), 2.0, dtype=dtype).log())
+            nn.Parameter(torch.full((groups, sets), 2.0, dtype=torch.float64).log())
             if kind == "bell"
             else None
         )
         # Linear coefficients and a constant, or only the constant.
         columns = inputs + 1 if order == 1 else 1
         self.consequents = nn.Parameter(
-            torch.zeros(groups, outputs, self.rules, columns, dtype=dtype)
+            torch.zeros(groups, outputs, self.rules, columns, dtype=torch.float64)
         )
         # A valid partition from the start, before the sets are placed from data.
         self.init_grid(-1.0, 1.0)
@@ -316,10 +323,11 @@ class Anfis(LinearOutputModule):
         )
         self.partition.assign(packed_centres, packed_widths, low, high)
         if slopes is not None:
-            if self.log_slopes is None:
-                raise ValueError("`slopes` belong to bells; this layer has Gaussian sets.")
+            packed_slopes = self._pack("slopes", slopes)
+            if self.log_slopes is None or not bool((packed_slopes > 0).all()):
+                raise ValueError("`slopes` must be positive, and belong to bells only.")
             with torch.no_grad():
-                self.log_slopes.copy_(self._pack("slopes", slopes).log())
+                self.log_slopes.copy_(packed_slopes.log())
 
     @torch.no_grad()
     def solve_consequents(
@@ -335,11 +343,10 @@ class Anfis(LinearOutputModule):
                 paper, which start from a covariance of 1e6. With 0, undetermined directions are
                 zero.
         Raises:
-            ValueError: if there are no samples, or some are not finite.
+            ValueError: if there are no samples, some are not finite, or shapes do not fit.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.consequents[0, 0].numel())
-        targets = y.reshape(-1, self.groups, self.outputs)
-        weights = ridge(features, targets, prior_precision)
+        weights = ridge(features, targets_of(x, y, self.outputs), prior_precision)
         self.consequents.copy_(weights.mT.reshape(self.consequents.shape))
 
     def _range(

@@ -98,6 +98,16 @@ class LinearOutputModule(nn.Module):
         return maps
 
 
+def targets_of(x: Tensor, y: Tensor, outputs: int) -> Tensor:
+    """Targets (samples, groups, outputs) of inputs (*batch, groups, inputs), finite."""
+    if y.shape != (*x.shape[:-1], outputs) or not bool(torch.isfinite(y).all()):
+        raise ValueError(
+            f"targets of inputs {tuple(x.shape)} must be finite and of shape "
+            f"{(*x.shape[:-1], outputs)}, got {tuple(y.shape)}."
+        )
+    return y.reshape(-1, *y.shape[-2:])
+
+
 def ridge(features: Tensor, targets: Tensor, prior_precision: float | Tensor) -> Tensor:
     """Minimiser of `|targets - features w|^2 + prior_precision |w|^2`.
 

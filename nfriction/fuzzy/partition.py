@@ -18,12 +18,12 @@ class FreePartition(nn.Module):
     after the other.
     """
 
-    def __init__(self, groups: int, terms: list[int], dtype: torch.dtype) -> None:
+    def __init__(self, groups: int, terms: list[int]) -> None:
         super().__init__()
         self.terms = terms
         sets = sum(terms)
-        self.centres = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
-        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
+        self.centres = nn.Parameter(torch.zeros(groups, sets, dtype=torch.float64))
+        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=torch.float64))
 
     def forward(self) -> tuple[Tensor, Tensor]:
         """Centres and widths, each of shape (groups, sets)."""
@@ -65,19 +65,17 @@ class OrderedPartition(nn.Module):
     lower: Tensor
     upper: Tensor
 
-    def __init__(
-        self, groups: int, terms: list[int], half_width: float, dtype: torch.dtype
-    ) -> None:
+    def __init__(self, groups: int, terms: list[int], half_width: float) -> None:
         super().__init__()
         self.terms = terms
         self.half_width = half_width  # of a set of width 1
         # Attributes, because TorchScript cannot read globals.
         self.least, self.span = MIN_SPACING, MAX_SPACING - MIN_SPACING
         sets, inputs = sum(terms), len(terms)
-        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
-        self.spacings = nn.Parameter(torch.zeros(groups, sets + inputs, dtype=dtype))
-        self.register_buffer("lower", torch.zeros(groups, inputs, dtype=dtype))
-        self.register_buffer("upper", torch.ones(groups, inputs, dtype=dtype))
+        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=torch.float64))
+        self.spacings = nn.Parameter(torch.zeros(groups, sets + inputs, dtype=torch.float64))
+        self.register_buffer("lower", torch.zeros(groups, inputs, dtype=torch.float64))
+        self.register_buffer("upper", torch.ones(groups, inputs, dtype=torch.float64))
 
     def forward(self) -> tuple[Tensor, Tensor]:
         """Centres and widths, each of shape (groups, sets)."""

@@ -44,7 +44,6 @@ class RBFNetwork(grouped.LinearOutputModule):
         outputs: int = 2,
         *,
         seed: int = 0,
-        dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
         if min(groups, inputs, units, outputs) < 1:
@@ -54,12 +53,12 @@ class RBFNetwork(grouped.LinearOutputModule):
             )
         self.groups, self.inputs, self.units, self.outputs = groups, inputs, units, outputs
         random = torch.Generator().manual_seed(seed)
-        weight = torch.randn(groups, outputs, units, generator=random, dtype=dtype)
-        self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
-        self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
+        weight = torch.randn(groups, outputs, units, generator=random, dtype=torch.float64)
+        self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=torch.float64))
+        self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=torch.float64))
         # Small, so that a new network is nearly flat; with zero, centres would have no gradient.
         self.output_weight = nn.Parameter(0.1 * weight)
-        self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=dtype))
+        self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=torch.float64))
         self.init_range(-1.0, 1.0, seed)
 
     def extra_repr(self) -> str:
@@ -88,7 +87,9 @@ class RBFNetwork(grouped.LinearOutputModule):
 
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """The units and 1, (groups, units + 1, samples), written to `out`."""
+        """The units and 1, (groups, units + 1, samples), in float64 written to `out`."""
+        if x.dtype != torch.float64:
+            return nn.functional.pad(self._activations(x), (0, 0, 0, 1), value=1.0)
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
@@ -146,6 +147,11 @@ class RBFNetwork(grouped.LinearOutputModule):
 
     def _activations(self, x: Tensor) -> Tensor:
         """Outputs of the units, shape (groups, units, samples)."""
+        if x.dtype != torch.float64:
+            # The expansion loses the digits of narrow units in single precision.
+            apart = (grouped.to_columns(x).unsqueeze(1) - self.centres.unsqueeze(-1)).square()
+            square = (apart * torch.exp(-2.0 * self.log_widths).unsqueeze(-1)).sum(2)
+            return torch.exp(-0.5 * square)
         constant, quadratic, powers = self._expanded(x)
         exponents = torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
         return torch.exp(exponents)
@@ -208,7 +214,7 @@ class RBFNetwork(grouped.LinearOutputModule):
             width: of every unit, relative to the standard deviation of each input.
         """
         samples = self._samples(x)
-        targets = y.reshape(-1, self.groups, self.outputs)
+        targets = grouped.targets_of(x, y, self.outputs)
         for group in range(self.groups):
             scale = width * samples[:, group].std(0)
             centres = _selected(samples[:, group], targets[:, group], self.units, scale)
@@ -226,7 +232,7 @@ class RBFNetwork(grouped.LinearOutputModule):
                 units + 1).
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
-        targets = y.reshape(-1, self.groups, self.outputs)
+        targets = grouped.targets_of(x, y, self.outputs)
         layer = grouped.ridge(features, targets, prior_precision).mT
         self.output_weight.copy_(layer[..., :-1])
         self.output_bias.copy_(layer[..., -1])
@@ -250,7 +256,7 @@ class AnfisRBF(nn.Module):
     Args:
         groups, inputs, terms, outputs: of the layer, see `Anfis`.
         units: of the head.
-        options: of the layer: order, kind, interpretable, dtype.
+        options: of the layer: order, kind, interpretable.
     """
 
     def __init__(
@@ -267,8 +273,7 @@ class AnfisRBF(nn.Module):
         super().__init__()
         self.groups, self.inputs, self.outputs = groups, inputs, outputs
         self.anfis = Anfis(groups, inputs, terms, outputs, **options)
-        dtype = self.anfis.consequents.dtype
-        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed)
         # A new head changes nothing.
         nn.init.zeros_(self.head.output_weight)
 

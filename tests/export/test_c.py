@@ -297,6 +297,29 @@ def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
     build([*CXX, f"-I{STUBS}", "-fsyntax-only", "-x", "c++", "nfriction.ino"], tmp_path)
 
 
+@pytest.mark.parametrize("with_filter", [False, True])
+def test_the_sketch_starts_at_rest_wherever_the_joints_are(tmp_path, with_filter):
+    """Positions of half a turn, not of zero, before the first call."""
+    c(random_model("LFM"), tmp_path, INFO, with_filter=with_filter)
+    (tmp_path / "main.cpp").write_text(
+        '#include "nfriction.ino"\n#include <cstdio>\n'
+        "static unsigned long now;\nunsigned long micros() { return now; }\n"
+        "int analogRead(int) { return 512; }\n"
+        'void analogWrite(int, int value) { std::printf("%d ", value); }\n'
+        "int main() {\n    setup();\n    loop();\n    now += PERIOD;\n    loop();\n}\n"
+    )
+    build(["gcc", "-c", "nfriction.c"], tmp_path)
+    build([*CXX, f"-I{STUBS}", "main.cpp", "nfriction.o", "-o", "sketch"], tmp_path)
+    said = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["128"] * 6
+
+
+@pytest.mark.parametrize(("law", "period"), [("LFM", "INHERITED_SAMPLE_TIME"), ("LuGre", "0.004")])
+def test_the_s_function_of_a_hidden_state_has_its_sample_time(tmp_path, law, period):
+    c(model_by_name(law)(2), tmp_path, ModelInfo(sample_time=0.004))
+    assert f"ssSetSampleTime(S, 0, {period})" in (tmp_path / "nfriction_sfun.c").read_text()
+
+
 @cases
 @pytest.mark.parametrize("with_filter", [False, True])
 @pytest.mark.parametrize("name", ["NLFM", "ALFM"])

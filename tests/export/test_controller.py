@@ -146,23 +146,27 @@ def test_the_filter_is_that_of_signals_on_differences() -> None:
 
 
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
-def test_the_filter_survives_a_lost_sample(name: str) -> None:
+@pytest.mark.parametrize("lost", [1, 100])
+def test_the_filter_survives_lost_samples(name: str, lost: int) -> None:
+    """At a constant velocity, where the velocity after the gap is that before it."""
     controller = controller_of(MODELS[name], INFO, with_filter=True)
     assert controller.inputs == ("q", "load")
-    q, load = draw(controller, 50)
-    state = controller.start(q[0], load[0])
-    for k in range(25):
-        *_, state = controller(q[k], load[k], state)
-    lost = q[25].clone()
-    lost[0] = math.inf
-    tau_f, _, status, after = controller(lost, load[25], state)
-    assert status[0] == NOT_FINITE
-    assert torch.isnan(tau_f).tolist() == [True, False, False]
-    torch.testing.assert_close(after[0], state[0])
+    qd = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+    q = math.pi + qd * INFO.sample_time * torch.arange(600, dtype=torch.float64).unsqueeze(-1)
+    q[400 : 400 + lost, 0] = math.inf
+    q[0, 1] = math.nan  # an encoder that is not ready yet
+    tau_f, _, status = controller.run(q, torch.ones_like(q))
+    # A velocity takes two positions in a row.
+    bad = torch.zeros_like(status, dtype=torch.bool)
+    bad[400 : 401 + lost, 0] = bad[:2, 1] = True
+    assert torch.equal(status == NOT_FINITE, bad)
+    assert torch.equal(torch.isnan(tau_f), bad)
+    settled = tau_f[399]
+    torch.testing.assert_close(tau_f[401 + lost :], settled.expand(599 - lost - 400, 3))
     # A load that is lost does not stop the filter.
-    *_, status, after = controller(q[25], load[25] * math.nan, state)
-    _, _, _, sound = controller(q[25], load[25], state)
-    assert (status == NOT_FINITE).all()
+    state = controller.start(q[300], settled)
+    *_, after = controller(q[301], settled * math.nan, state)
+    *_, sound = controller(q[301], settled, state)
     torch.testing.assert_close(after, sound)
 
 

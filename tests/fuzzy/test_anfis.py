@@ -210,7 +210,7 @@ def test_script_and_export_are_the_same(options: dict) -> None:
 
 
 def test_float32_follows() -> None:
-    layer = Anfis(2, 2, [3, 3], 1, dtype=torch.float32)
+    layer = Anfis(2, 2, [3, 3], 1).float()
     x = samples(10, 2, 2).float()
     layer.solve_consequents(x, x[..., :1] ** 2)
     assert layer(x).dtype == torch.float32

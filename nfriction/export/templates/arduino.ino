@@ -15,6 +15,8 @@ static nf_state state;
 static nf_filter filter;
 #endif
 static unsigned long next_call;
+// Positions of the last call.
+static double q[NF_JOINTS];
 
 // Share of the friction that is compensated: 1 drives the joint if the model is slightly too high.
 static const nf_real GAIN = (nf_real)0.8;
@@ -45,7 +47,7 @@ static nf_real read_torque(int joint)
 }
 
 {% endif %}
-static void read_positions(double *q)
+static void read_positions()
 {
     int j;
     for (j = 0; j < NF_JOINTS; ++j)
@@ -54,8 +56,7 @@ static void read_positions(double *q)
 
 void setup()
 {
-    double q[NF_JOINTS];
-    read_positions(q);
+    read_positions();
 #if NF_FILTER_SIZE
     nf_filter_init(&filter, q);
 #endif
@@ -68,7 +69,6 @@ void setup()
 
 void loop()
 {
-    static double q[NF_JOINTS];
     static nf_real qd[NF_JOINTS], qdd[NF_JOINTS];
     nf_real load[NF_JOINTS], tau[NF_JOINTS];
     nf_real coefficients[NF_JOINTS * NF_COEFFICIENTS];
@@ -79,7 +79,7 @@ void loop()
         return;
     next_call += PERIOD;
 #if NF_FILTER_SIZE
-    read_positions(q);
+    read_positions();
     nf_filter_step(&filter, q, qd, qdd);
 #else
     // For anything better than plain differences, export with the filter (--with-filter).

@@ -11,11 +11,9 @@ void nf_filter_init(nf_filter *filter, const double q[NF_JOINTS])
 {
     int j, i;
     for (j = 0; j < NF_JOINTS; ++j) {
-        const REAL given = (REAL)q[j];
-        for (i = 0; i < NF_FILTER_SIZE; ++i)
+        for (i = 1; i < NF_FILTER_SIZE; ++i)
             filter->memory[NF_FILTER_SIZE * j + i] = 0;
-        if (nf_finite(&given))
-            filter->memory[NF_FILTER_SIZE * j] = q[j];
+        filter->memory[NF_FILTER_SIZE * j] = q[j];
     }
 }
 
@@ -29,13 +27,15 @@ void nf_filter_step(
 {
     int j;
     for (j = 0; j < NF_JOINTS; ++j) {
-        const REAL given = (REAL)q[j];
         /* The last position, the last velocity, and two states of each low pass. */
         double *memory = filter->memory + NF_FILTER_SIZE * j;
+        const double difference = (q[j] - memory[0]) / {{ filter.sample_time }};
+        const REAL given = (REAL)difference;
+        memory[0] = q[j];
+        /* After a missing sample there is no difference yet: the low passes wait for one. */
         if (nf_finite(&given)) {
-            const double velocity = nf_low_pass((q[j] - memory[0]) / {{ filter.sample_time }}, memory + 2);
+            const double velocity = nf_low_pass(difference, memory + 2);
             const double acceleration = nf_low_pass((velocity - memory[1]) / {{ filter.sample_time }}, memory + 4);
-            memory[0] = q[j];
             memory[1] = velocity;
             qd[j] = (REAL)velocity;
             qdd[j] = (REAL)acceleration;

@@ -1,7 +1,8 @@
 /* Level-2 S-function around {{ name }}.h. Build it together with the controller:
  *     mex {{ name }}_sfun.c {{ name }}.c
  * Inputs: velocity, acceleration and, depending on a load function in {{ name }}.h, joint
- * position or load; outputs: torque, coefficients (joint by joint) and status bits. Runs at the sample time of the block that drives it.
+ * position or load; outputs: torque, coefficients (joint by joint) and status bits. Runs at the
+ * {{ "sample time of the model, because its state advances by one sample in every call" if held else "sample time of the block that drives it" }}.
  */
 #define S_FUNCTION_NAME {{ name }}_sfun
 #define S_FUNCTION_LEVEL 2
@@ -41,7 +42,7 @@ static void mdlInitializeSizes(SimStruct *S)
 
 static void mdlInitializeSampleTimes(SimStruct *S)
 {
-    ssSetSampleTime(S, 0, INHERITED_SAMPLE_TIME);
+    ssSetSampleTime(S, 0, {{ held or "INHERITED_SAMPLE_TIME" }});
     ssSetOffsetTime(S, 0, 0.0);
 }
 

@@ -167,7 +167,9 @@ def train_network(
         least-squares output layer for their initial sets.
 
     Raises:
-        ValueError: if samples do not match the network or are not finite, or an input never varies.
+        TypeError: if network and samples are not in double precision.
+        ValueError: if samples do not match the network, are not finite or mostly beyond its sets or
+            units, or an input never varies.
     """
     _check(network, x, y)
     scaling = Scaling.of(x, y)
@@ -227,6 +229,29 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
         )
     if len(x) == 0 or not (torch.isfinite(x).all() and torch.isfinite(y).all()):
         raise ValueError("`x` and `y` need samples, all finite; drop those with NaN or infinity.")
+    if {x.dtype, y.dtype, *(p.dtype for p in network.parameters())} != {torch.float64}:
+        raise TypeError("a network is trained in double precision: `network.double()`, `x.double()`.")
+    # A new network has its sets or units within [-1, 1].
+    lower, upper = _reach(network.anfis if isinstance(network, AnfisRBF) else network)
+    beyond = ((x < lower) | (x > upper)).double().mean(0).amax()
+    if beyond > 0.5:
+        raise ValueError(
+            f"{100 * float(beyond):.0f} % of the samples of an input are beyond the network's sets "
+            "or units; place these first (`init_grid(x.amin(0), x.amax(0))` or `init_kmeans(x)`)."
+        )
+
+
+def _reach(layer: Anfis | RBFNetwork) -> tuple[Tensor, Tensor]:
+    """Range that the sets or units of each input cover up to one width, each (group, input)."""
+    if isinstance(layer, RBFNetwork):
+        centres, widths = layer.centres, layer.log_widths.exp()
+        return (centres - widths).amin(1), (centres + widths).amax(1)
+    centres, widths = (values.split(layer.terms, 1) for values in layer.sets())
+    pairs = [*zip(centres, widths, strict=True)]
+    return (
+        torch.stack([(c - w).amin(1) for c, w in pairs], 1),
+        torch.stack([(c + w).amax(1) for c, w in pairs], 1),
+    )
 
 
 class NetworkGroup:
