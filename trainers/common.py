@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from matplotlib.ticker import MaxNLocator
 
+from nfriction.cli.inputs import positive
 from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import score
 from nfriction.export import torchscript
@@ -32,6 +33,13 @@ _IRRELEVANT = ("out", "resume")
 INTERRUPTED = 130
 
 
+def natural(text: str) -> int:
+    """A whole number from 1, for argparse."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {text!r}")
+    return int(text)
+
+
 def parser(description: str) -> argparse.ArgumentParser:
     """A parser with the options that all trainers have."""
     made = argparse.ArgumentParser(description=description)
@@ -39,16 +47,19 @@ def parser(description: str) -> argparse.ArgumentParser:
                       help="files with time, q1, q2, ...; omit for a simulated twin")  # fmt: skip
     made.add_argument("--twin", choices=twin.names(), default="tlrip",
                       help="the twin to use if no recording is given")  # fmt: skip
-    made.add_argument("--seconds", type=float, help="length of the twin's recordings [s]")
+    made.add_argument("--seconds", type=positive, help="length of the twin's recordings [s]")
     made.add_argument("--rig", help=f"a rig file, or one of {', '.join(rigs.names())}")
     made.add_argument("--angles", help="angle convention of the files, e.g. absolute,hanging")
     made.add_argument("--degrees", action="store_true", help="the files are in degrees")
     made.add_argument("--plant", choices=("fit", "given"), default="given",
                       help="fit: adjust inertia and gravity terms within bounds")  # fmt: skip
-    made.add_argument("--windows", type=float, nargs="+", default=[0.5, 2.0], metavar="SECONDS",
+    made.add_argument("--windows", type=positive, nargs="+", default=[0.5, 2.0], metavar="SECONDS",
                       help="lengths of the fitted windows")  # fmt: skip
     made.add_argument(
-        "--max-steps", type=int, default=30, help="limit on steps of the fit at each window length"
+        "--max-steps",
+        type=natural,
+        default=30,
+        help="limit on steps of the fit at each window length",
     )
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--out", type=Path, default=Path("runs/train"), help="folder to write")

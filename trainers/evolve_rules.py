@@ -4,7 +4,7 @@
 
 Coefficients by class define the output ranges of a controller with the papers' rules; evolution
 varies its ranges and the terms of its rules, and omits rules. Writes the Pareto front as table and
-figure, tested on recordings not used for tuning. `--resume` continues after the last generation.
+figure, with errors on a twin's test recordings. `--resume` continues after the last generation.
 """
 
 from collections.abc import Sequence
@@ -23,8 +23,9 @@ from nfriction.papers.controller.evolve import (
 )
 from nfriction.papers.reproduction.procedure import controllers_from_classes
 from nfriction.papers.reproduction.stages import fit_by_class
-from nfriction.plant import Plant
+from nfriction.papers.reproduction.workspace import Bench
 from nfriction.plots import style
+from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
@@ -35,9 +36,9 @@ THINNED, BLOCK = 5, 10
 def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
     parser.add_argument("--model", choices=MODELS, default="ALFM")
-    parser.add_argument("--joint", type=int, default=1, help="of the rig, from 1")
-    parser.add_argument("--population", type=int, default=20)
-    parser.add_argument("--generations", type=int, default=40)
+    parser.add_argument("--joint", type=common.natural, default=1, help="of the rig, from 1")
+    parser.add_argument("--population", type=common.natural, default=20)
+    parser.add_argument("--generations", type=common.natural, default=40)
     parser.add_argument("--prices", type=float, nargs="+", default=[0.0, 0.1, 0.3, 1.0],
                         help="of all rules, as shares of the first error")  # fmt: skip
     given = parser.parse_args(argv)
@@ -53,42 +54,47 @@ def train(argv: Sequence[str] | None) -> str:
     if not 1 <= given.joint <= len(controllers):
         raise ValueError(f"--joint must be 1 to {len(controllers)}, got {given.joint}.")
     start, joint = controllers[given.joint - 1], given.joint - 1
-    samples = _samples(bench.plant, train_motions, joint)
+    samples = _samples(bench, bench.train, train_motions, joint)
     options = EvolutionOptions(
         prices=tuple(given.prices), population=given.population, generations=given.generations,
         seed=given.seed, checkpoint=given.out / "checkpoints" / "evolution.json",
     )  # fmt: skip
     front = evolve(start, adaptive.law, samples, v_smooth=adaptive.v_smooth, options=options)
-    others = bench.motions[len(train_motions) :] or train_motions
-    judged = _samples(bench.plant, others, joint)
     first = Candidate(
         start, torque_error(start, adaptive.law, samples, adaptive.v_smooth),
         len(start.rule_base.rules),
     )  # fmt: skip
     table = pd.DataFrame(
-        [
-            (one.rules, 1e3 * one.error,
-             1e3 * torque_error(one.controller, adaptive.law, judged, adaptive.v_smooth))
-            for one in (first, *front)
-        ],
+        [(one.rules, 1e3 * one.error) for one in (first, *front)],
         index=["as given", *(f"candidate {k + 1}" for k in range(len(front)))],
-        columns=["rules", "training error [mN m]", "test error [mN m]"],
-    )  # fmt: skip
+        columns=["rules", "training error [mN m]"],
+    )
+    if bench.test:
+        judged = _samples(bench, bench.test, bench.motions[len(train_motions) :], joint)
+        table["test error [mN m]"] = [
+            1e3 * torque_error(one.controller, adaptive.law, judged, adaptive.v_smooth)
+            for one in (first, *front)
+        ]
     table.to_csv(given.out / "pareto.csv", index_label="controller")
     _draw(table).savefig(given.out / "pareto.png", dpi=150)
     return f"{table.round(3).to_string()}\nwrote {given.out / 'pareto.csv'} and its figure"
 
 
-def _samples(plant: Plant, motions: Sequence[Motion], joint: int) -> TorqueSamples:
-    """Motion and friction torque of one joint of a freely swinging rig."""
+def _samples(
+    bench: Bench, recordings: Sequence[Recording], motions: Sequence[Motion], joint: int
+) -> TorqueSamples:
+    """Motion and friction torque of one joint: the drive's torque minus that of the motion."""
+    plant = bench.plant
+    driven = [r.joint_coordinates(plant).torque_at(r.time) for r in recordings]
+    tau = torch.as_tensor(np.concatenate(driven))
     q, qd, qdd = (
         torch.as_tensor(np.concatenate([getattr(m, key) for m in motions]))
         for key in ("q", "qd", "qdd")
     )
     q, qd, qdd = q[::THINNED], qd[::THINNED], qdd[::THINNED]
     with torch.no_grad():
-        # Without a drive, friction is the negative of the torque from inverse dynamics.
-        torque, load = -plant.inverse_dynamics(q, qd, qdd), plant.load(q, qd)
+        torque = tau[::THINNED] - plant.inverse_dynamics(q, qd, qdd)
+        load = plant.load(q, qd)
     return TorqueSamples(qd[:, joint], qdd[:, joint], load[:, joint], torque[:, joint], BLOCK)
 
 

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from nfriction import fit, rollout, save
+from nfriction.cli.inputs import positive
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo
 from nfriction.papers.control import study
@@ -43,15 +44,17 @@ def train(argv: Sequence[str] | None) -> str:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seconds", type=float, default=90.0, help="of the warming motion")
+    parser.add_argument("--seconds", type=positive, default=90.0, help="of the warming motion")
     parser.add_argument("--fall", type=float, default=0.4, help="share that friction loses")
-    parser.add_argument("--warming", type=float, default=30.0, help="time constant of it [s]")
-    parser.add_argument("--units", type=int, default=10, help="of the network")
-    parser.add_argument("--forgetting", type=float, default=10.0, help="of the learning [s]")
+    parser.add_argument("--warming", type=positive, default=30.0, help="time constant of it [s]")
+    parser.add_argument("--units", type=common.natural, default=10, help="of the network")
+    parser.add_argument("--forgetting", type=positive, default=10.0, help="of the learning [s]")
     parser.add_argument("--seed", type=int, default=0, help="of the motor's torque")
     parser.add_argument("--out", type=Path, default=Path("runs/online"), help="folder to write")
     given = parser.parse_args(argv)
     # A row of the table is a full block.
+    if not 0 <= given.fall < 1:
+        parser.error(f"--fall must be a share from 0 and below 1, got {given.fall:g}.")
     if given.seconds < BLOCK:
         parser.error(f"--seconds must be at least {BLOCK:g}, got {given.seconds:g}.")
     plant = study.single_link()

@@ -22,7 +22,9 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--model", choices=MODELS, default="ALFM")
     parser.add_argument("--method", choices=("gauss-newton", "pattern", "sqp"),
                         default="gauss-newton")  # fmt: skip
-    parser.add_argument("--max-evaluations", type=int, default=5000, help="limit for a search")
+    parser.add_argument(
+        "--max-evaluations", type=common.natural, default=5000, help="limit for a search"
+    )
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "gauss-newton":

@@ -25,7 +25,9 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--method", choices=("trajectory", "pattern", "sqp"), default="trajectory")
     parser.add_argument("--horizon", type=float, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip
-    parser.add_argument("--max-evaluations", type=int, default=5000, help="limit for a search")
+    parser.add_argument(
+        "--max-evaluations", type=common.natural, default=5000, help="limit for a search"
+    )
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "trajectory":

@@ -32,11 +32,13 @@ def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
     parser.add_argument("--model", choices=MODELS, default="NFLFM")
     parser.add_argument("--procedure", choices=("ours", "papers"), default="ours")
-    parser.add_argument("--samples", type=int, default=40_000,
+    parser.add_argument("--samples", type=common.natural, default=40_000,
                         help="of the papers' controller, per joint")  # fmt: skip
-    parser.add_argument("--terms", type=int, nargs=2, default=[5, 5], metavar="SETS",
+    parser.add_argument("--terms", type=common.natural, nargs=2, default=[5, 5], metavar="SETS",
                         help="fuzzy sets of velocity and of acceleration (our method)")  # fmt: skip
-    parser.add_argument("--units", type=int, default=10, help="of the radial basis network")
+    parser.add_argument(
+        "--units", type=common.natural, default=10, help="of the radial basis network"
+    )
     given = parser.parse_args(argv)
     if given.model == WITHOUT_CLASSES and given.procedure == "papers":
         raise ValueError(f"{given.model} has no classes; give --procedure ours.")

@@ -19,6 +19,7 @@ import torch
 from matplotlib.figure import Figure
 
 from nfriction import datasets, load
+from nfriction.cli.inputs import positive
 from nfriction.export import torchscript
 from nfriction.friction import model_names
 from nfriction.friction.laws import LINEAR, Law
@@ -41,12 +42,14 @@ def train(argv: Sequence[str] | None) -> str:
     )
     parser.add_argument("--adaptive", type=Path, metavar="MODEL",
                         help="adaptive model file whose classes span the controllers")  # fmt: skip
-    parser.add_argument("--units", type=int, default=10, help="of each network")
-    parser.add_argument("--max-steps", type=int, default=100, help="of Bayesian regularisation")
+    parser.add_argument("--units", type=common.natural, default=10, help="of each network")
+    parser.add_argument(
+        "--max-steps", type=common.natural, default=100, help="of Bayesian regularisation"
+    )
     parser.add_argument(
         "--starts", type=int, default=1, help="number of starts; the best by evidence is kept"
     )
-    parser.add_argument("--seconds", type=float, help="duration of the motion; default 40 s")
+    parser.add_argument("--seconds", type=positive, help="duration of the motion; default 40 s")
     parser.add_argument("--seed", type=int, default=0, help="of encoders and starts")
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
@@ -71,7 +74,7 @@ def train(argv: Sequence[str] | None) -> str:
     span = samples.y.amax(0) - samples.y.amin(0)
     error = (learnt - samples.y).square().mean(0).sqrt() / span
     common.draw_losses(losses, given.out / f"{path.stem}-loss.png")
-    _outputs(samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
+    _outputs(law, samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
     lines = [
         f"{path.stem}: {len(samples)} samples per joint, {given.units} units",
         *ended,
@@ -110,10 +113,11 @@ def _data(
     return adaptive.law, controllers, again
 
 
-def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
+def _outputs(law: Law, samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
     """Outputs of controller and network along the motion, one column per joint."""
     shown = samples.time <= SHOWN_SECONDS
     count = len(samples.output_names)
+    units = {c.name: c.unit for c in law.coefficients}
     figure, axes = style.panels(
         count, len(samples.joint_names), style.PAGE, 0.6 + 1.3 * count, sharex=True
     )
@@ -127,7 +131,7 @@ def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
             )  # fmt: skip
             if row == 0:
                 style.title(ax, joint)
-        axes[row, 0].set_ylabel(f"{name} [SI]")
+        axes[row, 0].set_ylabel(f"{name} [{units[name]}]")
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     style.legend(figure, [given, found], ["controller", "network"])

@@ -10,6 +10,8 @@ from nfriction.cli import inputs
 from nfriction.cli.console import Commands, UsageError, check_writable
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
 
@@ -45,8 +47,8 @@ def add_export(commands: Commands) -> None:
                         "states depend (default: that of the recordings)")  # fmt: skip
     parser.add_argument("--with-filter", action="store_true",
                         help="let the artefact take raw positions and filter them")  # fmt: skip
-    parser.add_argument("--cutoff", type=inputs.positive, default=20.0, metavar="HZ",
-                        help="cut-off of that filter [Hz]")  # fmt: skip
+    parser.add_argument("--cutoff", type=inputs.positive, metavar="HZ",
+                        help="cut-off of that filter [Hz] (default: 20)")  # fmt: skip
     parser.add_argument("--online", type=inputs.positive, metavar="NOISE",
                         help="C of a model with the papers' network that keeps learning while it "
                         "runs, from friction torque measured with this noise [N m]")  # fmt: skip
@@ -87,6 +89,8 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
     if arguments.patch and len(wanted) != 1:
         raise UsageError("--patch needs exactly one of mjcf and urdf in --format.")
+    if arguments.cutoff and not arguments.with_filter:
+        raise UsageError("--cutoff is that of the filter: add --with-filter.")
     if arguments.online and "c" not in arguments.format:
         raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
@@ -115,7 +119,7 @@ def _write_controller(
         # A single number applies to all joints.
         "torque_limit": limit[0] if limit and len(limit) == 1 else limit,
         "with_filter": arguments.with_filter,
-        "cutoff_hz": arguments.cutoff,
+        "cutoff_hz": arguments.cutoff or 20.0,
     }
     if target in IN_SINGLE:
         options["dtype"] = arguments.dtype
@@ -124,7 +128,7 @@ def _write_controller(
         name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
         name = name if is_identifier(name) else f"nf_{name}"
         paths = export.c(model, arguments.out, info, name=name, **options)
-        _prove(paths[0], model, info)
+        _prove(paths, model, info)
         if arguments.online:
             from nfriction.papers.nffem.online import OnlineOptions, write_online
 
@@ -135,13 +139,14 @@ def _write_controller(
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
 
 
-def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
+def _prove(paths: "Sequence[Path]", model: "FrictionModel", info: "ModelInfo") -> None:
     """Run exported C on this machine and compare it with the model, or print why that failed.
 
-    The other targets are compared when they are written.
+    The files are deleted if they differ. The other targets are compared when they are written.
     """
     from nfriction import export
 
+    source = paths[0]
     try:
         verdict = export.verify_artefact(source, model, info, points=1000)
     except export.ExportError as error:
@@ -149,7 +154,11 @@ def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
         print(f"{source} was not run here; run its self-test on the target ({error})")
     else:
         if not verdict.passed:
-            raise export.ExportError(f"{source} differs from its model: {verdict.points}.")
+            for path in paths:
+                path.unlink()
+            raise export.ExportError(
+                f"{source} differed from its model and was deleted: {verdict.points}."
+            )
 
 
 def _write_simulator(

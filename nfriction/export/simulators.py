@@ -241,7 +241,7 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
             f"damping and friction loss have no memory, but the law {model.law.name!r} has: export "
             "a model without memory, such as coulomb-viscous."
         )
-    time, q, qd, qdd = map(torch.as_tensor, (motion.time, motion.q, motion.qd, motion.qdd))
+    time, q, qd, qdd = map(torch.tensor, (motion.time, motion.q, motion.qd, motion.qdd))
     if load is None and has_input(model.law, "position"):
         raise ValueError("friction by position needs `load=plant.load`, of the plant of its fit.")
     weight = torch.ones_like(qd) if load is None else load(q, qd)

@@ -144,15 +144,14 @@ class SecondOrderLowPass:
         a2 = (1 - 2 * self.damping * warped + warped**2) / a0
         return np.array([b0, 2 * b0, b0]), np.array([1.0, a1, a2])
 
-    def __call__(self, values: ArrayLike, state: Array | None = None) -> Array:
-        """Filter an array (time, ...), at rest at its first sample unless a state is given."""
+    def __call__(self, values: ArrayLike) -> Array:
+        """Filter an array (time, ...), at rest at its first sample."""
         from scipy.signal import lfilter  # slow to import
 
         values = np.asarray(values, dtype=np.float64)
         b, a = self.coefficients
-        if state is None:
-            state = np.stack([(1 - b[0]) * values[0], (b[2] - a[2]) * values[0]])
-        filtered, _ = lfilter(b, a, values, axis=0, zi=state)
+        rest = np.stack([(1 - b[0]) * values[0], (b[2] - a[2]) * values[0]])
+        filtered, _ = lfilter(b, a, values, axis=0, zi=rest)
         return np.asarray(filtered)
 
 

@@ -106,7 +106,8 @@ def test_exported_c_is_run_or_said_not_to_be(
         assert "not run" not in capsys.readouterr().out
         monkeypatch.setattr(ControllerC, "literal", lambda self, value: "0.5")
         assert cli.main(words) == 2
-        assert "lfm.c differs from its model" in capsys.readouterr().err
+        assert "lfm.c differed from its model and was deleted" in capsys.readouterr().err
+        assert not [*(tmp_path / "out").iterdir()]
     monkeypatch.setenv("CC", "absent-compiler")
     assert cli.main(words) == 0
     assert "lfm.c was not run here; run its self-test" in capsys.readouterr().out

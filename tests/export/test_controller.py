@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.export.contract import draw
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.friction.models import LFM
 from nfriction.friction.neurofuzzy import NFLFM
@@ -134,9 +133,8 @@ def test_the_filter_is_that_of_signals_on_differences() -> None:
     def difference(x: np.ndarray, before: np.ndarray) -> np.ndarray:
         return np.diff(x, axis=0, prepend=before) / 1e-3
 
-    rest = np.zeros((2, 3))
-    qd = low_pass(difference(q, q[:1]), rest)
-    qdd = low_pass(difference(qd, np.zeros((1, 3))), rest)
+    qd = low_pass(difference(q, q[:1]))
+    qdd = low_pass(difference(qd, np.zeros((1, 3))))
     expected = model(torch.as_tensor(qd), torch.as_tensor(qdd), load)
     state = controller.start(torch.as_tensor(q[0]), load[0])
     for k in range(400):

@@ -1,5 +1,8 @@
 """Radial basis functions: their formula, placing of centres, and a head that starts as nothing."""
 
+import math
+from copy import deepcopy
+
 import pytest
 import torch
 from torch import nn
@@ -191,3 +194,22 @@ def test_unsound_sizes_and_samples_are_refused() -> None:
         network.init_kmeans(x * torch.tensor([1.0, 0.0]))
     with pytest.raises(ValueError, match="range"):
         network.init_range(1.0, 0.0)
+    targets = surface(x)
+    for y in (targets.squeeze(1).T, targets[:40], torch.full_like(targets, torch.nan)):
+        for place in (network.solve_output, network.init_ols):
+            with pytest.raises(ValueError, match="must be finite and of shape"):
+                place(x, y)
+
+
+@pytest.mark.parametrize("width", [1e-1, 1e-3, 1e-5])
+def test_narrow_units_are_right_in_single_precision(width: float) -> None:
+    """Units one apart; the expanded square would lose the digits of their distances."""
+    network = RBFNetwork(1, inputs=1, units=2, outputs=1).requires_grad_(False)
+    network.centres.copy_(torch.tensor([[[0.0], [1.0]]]))
+    network.log_widths.fill_(math.log(width))
+    x = torch.tensor([[[0.1 * width]], [[-2.0 * width]]], dtype=FLOAT64)
+    single = deepcopy(network).float()
+    for form in ("forward", "activations", "regressors"):
+        found = getattr(single, form)(x.float())
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found.double(), getattr(network, form)(x), rtol=1e-4, atol=1e-6)

@@ -10,13 +10,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from nfriction import ANCFM, load, save
+from nfriction import ANCFM, CVFM, load, rollout, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
+from nfriction.plant import PendulumChain, rigs
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
 sys.path.insert(0, str(TRAINERS))  # as when a script of that folder runs
@@ -203,3 +205,28 @@ def test_rules_evolve_to_a_front_and_go_on(
     assert (tmp_path / "pareto.png").stat().st_size > 0
     train(*words, "--resume")
     assert capsys.readouterr().out == first
+
+
+@pytest.mark.slow
+def test_rules_evolve_on_a_driven_rig_of_ones_own(tmp_path: Path) -> None:
+    """The torque of the drive is no friction, and there are no test recordings."""
+    plant = PendulumChain([0.5], [0.4], [0.2], [0.01])
+    law = CVFM(1, [[0.05, 0.02]]).requires_grad_(False)
+    time = np.arange(8000) / 1000
+    # Of growing size, so that the acceleration has classes.
+    tau = (0.1 + 0.08 * time) * np.sin(5 * time + np.sin(3 * time))
+    tau = tau[:, None]
+    zero = torch.zeros(1, dtype=torch.float64)
+    moved = rollout(plant, law, zero + 3, zero, tau=tau, sample_time=1e-3)
+    table = pd.DataFrame(
+        {"time": time, "q1": moved.q[:, 0].numpy()[: len(time)], "tau1": tau[:, 0]}
+    )
+    table.to_csv(tmp_path / "run.csv", index=False)
+    rigs.write(plant, tmp_path / "rig.json")
+    train("evolve_rules.py", tmp_path / "run.csv", "--rig",
+          tmp_path / "rig.json", "--model", "ACVFM", "--population", "5", "--prices", "0",
+          "--generations", "1", "--max-steps", "5", "--out", tmp_path / "out")  # fmt: skip
+    found = pd.read_csv(tmp_path / "out" / "pareto.csv", index_col=0)
+    assert [*found.columns] == ["rules", "training error [mN m]"]
+    # The drive's torque is about 300 mN m.
+    assert found["training error [mN m]"].iloc[0] < 5

@@ -120,7 +120,16 @@ def read_samples(
     """Samples from the folder to which `build_samples` wrote them; ValueError if changed since."""
     folder = Path(folder)
     tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
-    outputs = tuple(tables[0].columns[1 + len(INPUTS) :])
+    outputs = tuple(name for name in map(str, tables[0]) if name not in ("time", *INPUTS))
+    for name, table in zip(joint_names, tables, strict=True):
+        wanted = {"time", *INPUTS, *outputs}
+        sound = {*table} == wanted and len(table) == len(tables[0]) and outputs
+        if not sound or not np.isfinite(table.to_numpy(dtype=np.float64)).all():
+            raise ValueError(
+                f"{folder / name}.csv.gz needs the columns time, {', '.join(INPUTS)} and outputs, "
+                f"finite and as long as those of {joint_names[0]}; got "
+                f"{', '.join(map(str, table))} and {len(table)} rows."
+            )
     x, y = (
         torch.tensor(np.stack([table[list(names)].to_numpy() for table in tables], 1))
         for names in (INPUTS, outputs)

@@ -7,7 +7,8 @@ coefficient's scale s_k, a joint's torque is f . w with f_ku = g_k s_k phi_u, an
     w += P f e / (l r^2 + f'P f),    P = (P - P f f'P / (l r^2 + f'P f)) / l
 
 given the torque error e, its standard deviation r and the forgetting factor l. The coefficients are
-bounded by a margin around the trained ones, and the covariance P by its initial trace.
+bounded by a margin around the trained ones, the covariance P by its initial trace, and an error by
+three of its standard deviations (Huber's loss), so that an outlier moves little.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.version import __version__
 
 TEMPLATES = ("nfriction.papers.nffem",)
+# Standard deviations from which an error counts as an outlier, as by the three-sigma rule.
+OUTLIER = 3.0
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,11 @@ class OnlineNetwork:
         f = ((slopes * self.scale).unsqueeze(-1) * phi.unsqueeze(-2)).flatten(-2)
         pf = (self.covariance @ f.unsqueeze(-1)).squeeze(-1)
         spread = options.forget * options.noise**2 + (pf * f).sum(-1, keepdim=True)
-        move = (pf / spread * (measured - torque).unsqueeze(-1)).view_as(self.weight)
+        # An overflow of a huge input would never leave the weights.
+        known = known & (spread.squeeze(-1) < math.inf)
+        most = OUTLIER * spread.squeeze(-1).sqrt()
+        error = torch.minimum(torch.maximum(measured - torque, -most), most)
+        move = (pf / spread * error.unsqueeze(-1)).view_as(self.weight)
         left = self.covariance - pf.unsqueeze(-1) * (pf / spread).unsqueeze(-2)
         trace = left.diagonal(dim1=-2, dim2=-1).sum(-1) / options.forget
         # Without this, the covariance would grow without bound in directions that are not excited.
@@ -190,7 +197,7 @@ def write_online(
         "name": name, "model": type(model).__name__, "version": __version__,
         "joints": model.joints, "coefficients": len(model.law.names), "units": network.units,
         "along_motion": schedule.along_motion, "turn": schedule.turn, "law": law, "torque": torque,
-        "variance": options.spread**2, "noise_variance": options.noise**2,
+        "outlier": OUTLIER, "variance": options.spread**2, "noise_variance": options.noise**2,
         "forget": options.forget, "slowest": options.slowest, "forgetting": options.forgetting,
         "sample_time": options.sample_time,
         "table": lambda key, *sizes: dialect.table(key, values[key].detach(), *sizes),

@@ -69,10 +69,11 @@ class TrainingOptions(EvidenceOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.starts < 1 or self.search_samples < 1:
+        if min(self.starts, self.search_samples) < 1 or min(self.max_steps, self.search_steps) < 0:
             raise ValueError(
-                "`starts` and `search_samples` must be at least 1, got "
-                f"{self.starts}, {self.search_samples}."
+                "`starts` and `search_samples` must be at least 1, and `max_steps` and "
+                f"`search_steps` not negative, got {self.starts}, {self.search_samples}, "
+                f"{self.max_steps}, {self.search_steps}."
             )
 
 
@@ -230,24 +231,27 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
     if len(x) == 0 or not (torch.isfinite(x).all() and torch.isfinite(y).all()):
         raise ValueError("`x` and `y` need samples, all finite; drop those with NaN or infinity.")
     if {x.dtype, y.dtype, *(p.dtype for p in network.parameters())} != {torch.float64}:
-        raise TypeError("a network is trained in double precision: `network.double()`, `x.double()`.")
+        raise TypeError(
+            "a network is trained in double precision: `network.double()`, `x.double()`."
+        )
     # A new network has its sets or units within [-1, 1].
     lower, upper = _reach(network.anfis if isinstance(network, AnfisRBF) else network)
-    beyond = ((x < lower) | (x > upper)).double().mean(0).amax()
-    if beyond > 0.5:
+    least, most = x.amin(0), x.amax(0)
+    covered = torch.minimum(upper, most) - torch.maximum(lower, least)
+    if (covered < 0.1 * (most - least)).any():
         raise ValueError(
-            f"{100 * float(beyond):.0f} % of the samples of an input are beyond the network's sets "
-            "or units; place these first (`init_grid(x.amin(0), x.amax(0))` or `init_kmeans(x)`)."
+            "the network's sets or units cover less than a tenth of the range of an input; place "
+            "them first: `init_grid(x.amin(0), x.amax(0))` or `init_kmeans(x)`."
         )
 
 
 def _reach(layer: Anfis | RBFNetwork) -> tuple[Tensor, Tensor]:
-    """Range that the sets or units of each input cover up to one width, each (group, input)."""
+    """Range in which sets or units of each input exceed about 1 %, each (group, input)."""
     if isinstance(layer, RBFNetwork):
-        centres, widths = layer.centres, layer.log_widths.exp()
-        return (centres - widths).amin(1), (centres + widths).amax(1)
+        centres, reach = layer.centres, 3 * layer.log_widths.exp()
+        return (centres - reach).amin(1), (centres + reach).amax(1)
     centres, widths = (values.split(layer.terms, 1) for values in layer.sets())
-    pairs = [*zip(centres, widths, strict=True)]
+    pairs = [(c, 3 * w) for c, w in zip(centres, widths, strict=True)]
     return (
         torch.stack([(c - w).amin(1) for c, w in pairs], 1),
         torch.stack([(c + w).amax(1) for c, w in pairs], 1),

@@ -3,13 +3,19 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from nfriction import datasets
 from nfriction.papers import twin
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.samples import ControllerSamples, checksums, sampled
+from nfriction.papers.controller.samples import (
+    ControllerSamples,
+    checksums,
+    read_samples,
+    sampled,
+)
 from nfriction.signals import Motion
 
 CARDS = Path(__file__).resolve().parents[3] / "datasets"
@@ -41,6 +47,24 @@ def test_what_was_built_is_read_later_and_a_change_is_noticed(tmp_path: Path) ->
     table.to_csv(folder / "joint3.csv.gz", index=False)
     with pytest.raises(ValueError, match="differ from checksums"):
         controller_samples(duration=0.2, cache=tmp_path)
+
+
+def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Path) -> None:
+    first = controller_samples(duration=0.2, cache=tmp_path / "cache")
+    tables = {name: first.to_pandas(j) for j, name in enumerate(first.joint_names)}
+
+    def read(**changed: pd.DataFrame) -> ControllerSamples:
+        for name, table in (tables | changed).items():
+            table.to_csv(tmp_path / f"{name}.csv.gz", index=False)
+        return read_samples(tmp_path)
+
+    turned = {name: table[["time", "B", "C", "acceleration", "speed"]]
+              for name, table in tables.items()}  # fmt: skip
+    torch.testing.assert_close(read(**turned).y, first.y)
+    table = tables["joint3"]
+    for wrong in (table.rename(columns={"speed": "velocity"}), table[:-1], table.assign(B=np.nan)):
+        with pytest.raises(ValueError, match=r"joint3.csv.gz needs the columns time, speed, acc"):
+            read(joint3=wrong)
 
 
 @pytest.mark.parametrize("name", [n for n in datasets.names() if n.endswith("_twin")])

@@ -88,6 +88,23 @@ def test_wild_torques_leave_everything_bounded() -> None:
     torch.testing.assert_close(online.most, 3 * made.schedule.network.output_bias.detach())
 
 
+def test_one_outlier_or_an_overflow_moves_little() -> None:
+    made = model()
+    qd, qdd, load = motions(800)
+    noise = 0.02 * torch.randn(qd.shape, generator=torch.Generator().manual_seed(1))
+    measured = 0.6 * made.torque(qd, load, made.coefficients(qd, qdd)) + noise
+    torques = []
+    for spoilt in (False, True):
+        online = OnlineNetwork(made, OPTIONS)
+        for k, sample in enumerate(zip(qd, qdd, load, measured, strict=True)):
+            if spoilt and k == 600:
+                online.learn(*sample[:3], torch.full_like(sample[3], 1e3))
+                online.learn(sample[0], sample[1], 0 * sample[2] + 1e200, sample[3])
+            online.learn(*sample)
+        torques.append(online(qd, qdd, load)[0])
+    assert (torques[1] - torques[0]).square().mean().sqrt() < 0.02
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", [NFLFM, NFNLFM])
 @pytest.mark.parametrize("acceleration", ["signed", "along_motion"])
@@ -113,9 +130,11 @@ def test_the_c_learns_the_same(kind: type, acceleration: str, tmp_path: Path) ->
     noise = 0.05 * torch.randn(qd.shape, generator=random, dtype=torch.float64)
     # A model's torque lies in memory joint by joint; C takes sample by sample.
     measured = (0.6 * made(qd, qdd, load) + noise).contiguous()
-    measured[7, 0] = torch.inf
+    measured[7, 0], measured[90, 1] = torch.inf, 1e3
+    loads = load.clone()
+    loads[120, 0] = 1e200
     tau, coefficients = np.zeros(2), np.zeros((2, len(made.law.names)))
-    for sample in zip(qd, qdd, load, measured, strict=True):
+    for sample in zip(qd, qdd, loads, measured, strict=True):
         online.learn(*sample)
         code.rig_learn(pointer(learner), *(pointer(x.numpy()) for x in sample))
     for motion in zip(qd, qdd, load, strict=True):

@@ -215,6 +215,13 @@ def test_misfits_are_refused_at_the_border() -> None:
         train_network(network, x * torch.tensor([1.0, 0.0]), surface(x))
     with pytest.raises(ValueError, match="starts"):
         TrainingOptions(starts=0)
+    with pytest.raises(ValueError, match="not negative"):
+        TrainingOptions(max_steps=-1)
+    with pytest.raises(TypeError, match="double precision"):
+        train_network(Anfis(1, 2, [2, 2], 2).float(), x.float(), surface(x).float())
+    for made in (Anfis(1, 2, [2, 2], 2), RBFNetwork(1)):
+        with pytest.raises(ValueError, match="cover less than a tenth of the range of an input"):
+            train_network(made, 1000 * x + 500, surface(x))
     with pytest.raises(TypeError, match="Linear"):
         train_network(nn.Linear(2, 2), x, surface(x))
     with pytest.raises(ValueError, match="controllers"):
