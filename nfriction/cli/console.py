@@ -177,7 +177,7 @@ _QUIET = 10.0
 
 
 class Progress:
-    """Progress through the stages of a run, also logged, with elapsed and remaining time.
+    """Progress through the stages of a run, also logged, with elapsed time.
 
     On a terminal it is a bar; otherwise, as in a job's log, at most one line every ten seconds.
     """
@@ -187,8 +187,8 @@ class Progress:
         from tqdm import tqdm
 
         self._what, self._logger = "start", logger
-        self._begun = self._shown = self._last_end = time.monotonic()
-        self._ended = self._expected = self._long = self._steps = 0
+        self._begun = self._shown = time.monotonic()
+        self._ended = self._expected = self._steps = 0
         self._bar = tqdm(disable=not sys.stderr.isatty(), leave=False, bar_format="{desc} {bar:20}")
 
     def __enter__(self) -> "Progress":
@@ -208,17 +208,15 @@ class Progress:
         self._what, self._steps = what, 0
         self._show(what)
 
-    def expect(self, stages: int, *, brief: bool = False) -> None:
-        """Announce further stages; brief ones come after all others."""
+    def expect(self, stages: int) -> None:
+        """Announce further stages."""
         self._expected += stages
-        self._long += 0 if brief else stages
         self._bar.total = self._expected
 
     def done(self) -> None:
         """End a stage."""
         self._check()
         self._ended += 1
-        self._last_end = time.monotonic()
         self._bar.update()
 
     def step(self, stage: str) -> None:
@@ -234,26 +232,13 @@ class Progress:
 
     def _show(self, what: str) -> None:
         now = time.monotonic()
-        line = f"{self._count()}{what} ({self._times(now - self._begun)})"
+        count = f"{self._ended + 1} of {self._expected}: " if self._expected else ""
+        line = f"{count}{what} ({now - self._begun:.0f} s)"
         if not self._bar.disable:
             self._bar.set_description_str(line)
         elif now - self._shown >= _QUIET:
             self._shown = now
             print(f"nfriction: {line}", file=sys.stderr, flush=True)
-
-    def _count(self) -> str:
-        return f"{self._ended + 1} of {self._expected}: " if self._expected else ""
-
-    def _times(self, passed: float) -> str:
-        """Elapsed time, and remaining time estimated from the mean of the finished long stages."""
-        text = f"{passed:.0f} s"
-        ended = self._last_end - self._begun
-        # No estimate once the running stage alone has taken longer.
-        left = ended / max(1, self._ended) * (self._long - self._ended) - (passed - ended)
-        if self._ended and left > 0:
-            rest = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-            text += f", about {rest} left"
-        return text
 
     def _check(self) -> None:
         if _interrupted.is_set():

@@ -154,7 +154,7 @@ def compare_and_report(
     selection = None
     with exclusive(arguments.out), _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
-        progress.expect(1, brief=True)
+        progress.expect(1)
         logger.info(arguments.command_line)
         if arguments.select:
             selection = select(plant, arguments.models, train, **settings)

@@ -402,7 +402,7 @@ def compare(
         require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
-    progress.expect(1 + len(set(map(model_name, models))), brief=True)  # scores, besides fits
+    progress.expect(1 + len(set(map(model_name, models))))  # scores, besides fits
     # Smoothed once for all fits.
     data, tested = (
         Data(part, [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in part])

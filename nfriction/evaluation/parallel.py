@@ -44,8 +44,8 @@ _PACKAGE = logging.getLogger("nfriction")
 class Progress:
     """Receiver of progress reports; this one ignores them."""
 
-    def expect(self, stages: int, *, brief: bool = False) -> None:
-        """Announce further stages; brief ones come after all others."""
+    def expect(self, stages: int) -> None:
+        """Announce further stages."""
 
     def stage(self, what: str) -> None:
         """Begin a stage; several may run at the same time."""
