@@ -4,14 +4,13 @@ import argparse
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Commands, UsageError, check_writable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
 
@@ -127,8 +126,11 @@ def _write_controller(
     if target == "c":
         name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
         name = name if is_identifier(name) else f"nf_{name}"
-        paths = export.c(model, arguments.out, info, name=name, **options)
-        _prove(paths, model, info)
+        # What was there before stays if the new code differs from its model.
+        with TemporaryDirectory(dir=arguments.out) as folder:
+            proven = export.c(model, folder, info, name=name, **options)
+            _prove(proven[0], model, info)
+            paths = [path.replace(arguments.out / path.name) for path in proven]
         if arguments.online:
             from nfriction.papers.nffem.online import OnlineOptions, write_online
 
@@ -139,25 +141,22 @@ def _write_controller(
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
 
 
-def _prove(paths: "Sequence[Path]", model: "FrictionModel", info: "ModelInfo") -> None:
+def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
     """Run exported C on this machine and compare it with the model, or print why that failed.
 
-    The files are deleted if they differ. The other targets are compared when they are written.
+    The other targets are compared when they are written.
     """
     from nfriction import export
 
-    source = paths[0]
     try:
         verdict = export.verify_artefact(source, model, info, points=1000)
     except export.ExportError as error:
         # There may be no compiler, or CC may be one for another machine.
-        print(f"{source} was not run here; run its self-test on the target ({error})")
+        print(f"{source.name} was not run here; run its self-test on the target ({error})")
     else:
         if not verdict.passed:
-            for path in paths:
-                path.unlink()
             raise export.ExportError(
-                f"{source} differed from its model and was deleted: {verdict.points}."
+                f"{source.name} differs from its model and was not written: {verdict.points}."
             )
 
 

@@ -303,7 +303,8 @@ def contract_of(
         "status_bits": {"outside": OUTSIDE, "not_finite": NOT_FINITE, "saturated": SATURATED},
         "edges": {
             "outside_input_ranges": f"coefficients {beyond}; the law continues",
-            "not_finite": "NaN torque and coefficients of that joint; its state is unchanged",
+            "not_finite": "NaN torque and coefficients of that joint; its state is unchanged"
+            + "; the next sample, which has no difference yet, is NaN, too" * controller.filters,
         },
     }
     # Through JSON, so that tuples become lists, as for a reader.

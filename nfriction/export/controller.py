@@ -88,7 +88,8 @@ class Controller(nn.Module):
     load, or with the filter position and load: velocity is then the difference of the position
     through a causal second-order low-pass filter, acceleration the difference of that velocity
     through the same filter again. An input that is not finite leaves the state of its joint
-    unchanged, a load only if the state depends on it.
+    unchanged, a load only if the state depends on it; a filter forgets its last position, so that
+    the next sample is NaN, too.
 
     Args:
         model, info, torque_limit: see `controller_of`.
@@ -220,7 +221,7 @@ class Controller(nn.Module):
         qdd, third, fourth = self._low_pass((qd - qd_last) / self.sample_time, third, fourth)
         following = torch.stack([q, qd, first, second, third, fourth], -1)
         # After a missing sample there is no difference yet: the low-pass filters wait for one.
-        waiting = torch.cat([q.unsqueeze(-1), state[..., 1:6]], -1)
+        waiting = torch.cat([_infinite_if_missing(q).unsqueeze(-1), state[..., 1:6]], -1)
         following = torch.where(qdd.abs().unsqueeze(-1) < math.inf, following, waiting)
         tau_f, coefficients, status, memory = self.step(qd, qdd, load, state[..., 6:])
         if self.remembers:
@@ -238,7 +239,7 @@ class Controller(nn.Module):
     def filtered_start(self, q: Tensor) -> Tensor:
         """State of a filter that has rested at `q`, (*batch, joint); a reset is the same."""
         rest = torch.zeros_like(q)
-        state = torch.stack([q, rest, rest, rest, rest, rest], -1)
+        state = torch.stack([_infinite_if_missing(q), rest, rest, rest, rest, rest], -1)
         if self.remembers:
             state = torch.cat([state, self.initial_memory(rest, rest)], -1)
         return state
@@ -276,6 +277,11 @@ class Controller(nn.Module):
         """Output and next state of the filter, in transposed direct form II."""
         y = self.b0 * x + s0
         return y, self.b1 * x - self.a1 * y + s1, self.b2 * x - self.a2 * y
+
+
+def _infinite_if_missing(q: Tensor) -> Tensor:
+    # In a state, NaN means a fresh start to ONNX and `torch.export`.
+    return torch.where(q.abs() < math.inf, q, math.inf)
 
 
 def run_in_order(

@@ -38,6 +38,8 @@ FEWEST_BLOCKS = 20
 ALIKE = 0.1
 # Logarithms of the ratios between which gears of robots lie.
 LOG_RATIOS = math.log(1.5), math.log(300.0)
+# Slots and poles of a motor have a least common multiple of at most about this.
+MOST_PER_TURN = 300
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -155,7 +157,7 @@ def likely_mistakes(
         unlike = [] if zeroed else unlike
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
-    rare = *_springs(plant, given), *_geared(plant, convention, given)
+    rare = *_springs(plant, given), *_geared(plant, convention, given), *_cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
     explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
     found = [Mistake(text, share) for text, share in (*unlike, *explain)]
@@ -748,7 +750,9 @@ def changing_friction(
                 constant, growing = torch.stack(squares).T
                 mean = float((clock - clock.min()).mean() / span)
                 change = _growth(piece < 0, *given)[0]
-                tried.append((growing, constant, np.var(rates), change, mean, period))
+                # No friction changes its sign; an exponential may fit where a line does not.
+                if change * (1 - mean) > -1 and change * mean < 1:
+                    tried.append((growing, constant, np.var(rates), change, mean, period))
             if not tried:
                 continue
             best = min(tried, key=lambda x: float(x[0].sum()))
@@ -756,10 +760,8 @@ def changing_friction(
             sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
-            # Friction that would change its sign is an error of the rig.
-            first, last = 1 - rate * mean, 1 + rate * (1 - mean)
-            seen = abs(rate) > least and min(first, last) > 0
-            if seen and gains(growing, constant, options.drift_chance):
+            if abs(rate) > least and gains(growing, constant, options.drift_chance):
+                first, last = 1 - rate * mean, 1 + rate * (1 - mean)
                 ratio, slope = last / first, (1 - mean) / last + mean / first
                 sd *= ratio * slope * student_quantile(pieces - 1, 0.975)
                 change, reach = (float(f"{100 * x:.2g}") for x in (abs(ratio - 1), sd))
@@ -875,6 +877,33 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         text = (
             f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit} that the rig lacks "
             f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]})"
+        )
+        yield text, _unexplained(plant, given, part)
+
+
+def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
+    """Each driven joint with a torque that repeats with its position, as of a motor's magnets."""
+    left, terms, weight = _equations(given, given.tau - given.needed(plant))
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist() if plant.unit == "rad" else ():
+        q, known = given.q[:, j], terms[:, j]
+        span = float(q.max() - q.min())
+        # At least two periods within the motion.
+        if not 2 * math.tau < MOST_PER_TURN * span < math.inf:
+            continue
+        rates = torch.arange(math.ceil(2 * math.tau / span), MOST_PER_TURN + 1)
+        waves = torch.stack([(q[:, None] * rates).sin(), (q[:, None] * rates).cos()], 2)
+        waves = (given.moving[:, [j], None] * given.mean(waves)).movedim(1, 0)
+        known = torch.linalg.qr(known[:, known.any(0)]).Q
+        rest, waves = (x - known @ (known.T @ x) for x in (left[:, j], waves))
+        if not bool(rest.isfinite().all()):
+            continue
+        sizes = torch.linalg.pinv(waves) @ rest
+        best = int((waves @ sizes[..., None]).square().sum((1, 2)).argmax())
+        part = torch.zeros(*given.q.shape, 2, dtype=q.dtype)
+        part[:, j] = torch.stack([(rates[best] * q).sin(), (rates[best] * q).cos()], 1)
+        text = (
+            f"{plant.joint_names[j]} has a torque of {float(sizes[best].norm() * weight[j]):.2g} "
+            f"N m that repeats {rates[best]} times per turn (cogging of its motor)"
         )
         yield text, _unexplained(plant, given, part)
 

@@ -78,7 +78,11 @@ class RBFNetwork(grouped.LinearOutputModule):
 
     @torch.no_grad()
     def input_jacobian(self, x: Tensor) -> Tensor:
-        """In closed form, from the expanded exponents."""
+        """In closed form, in float64 from the expanded exponents."""
+        if x.dtype != torch.float64:
+            apart = self._apart(x)
+            slopes = self._activations(x).unsqueeze(2) * apart / self.log_widths.exp().unsqueeze(-1)
+            return -torch.einsum("gku,guin->gkin", self.output_weight, slopes)
         _, quadratic, powers = self._expanded(x)
         weights = self.output_weight.unsqueeze(2) * quadratic.mT.unsqueeze(1)
         slopes = weights.flatten(1, 2) @ self._activations(x)
@@ -87,9 +91,10 @@ class RBFNetwork(grouped.LinearOutputModule):
 
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """The units and 1, (groups, units + 1, samples), in float64 written to `out`."""
+        """The units and 1, (groups, units + 1, samples), written to `out`."""
         if x.dtype != torch.float64:
-            return nn.functional.pad(self._activations(x), (0, 0, 0, 1), value=1.0)
+            found = nn.functional.pad(self._activations(x), (0, 0, 0, 1), value=1.0)
+            return found if out is None else out.copy_(found)
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
@@ -149,12 +154,15 @@ class RBFNetwork(grouped.LinearOutputModule):
         """Outputs of the units, shape (groups, units, samples)."""
         if x.dtype != torch.float64:
             # The expansion loses the digits of narrow units in single precision.
-            apart = (grouped.to_columns(x).unsqueeze(1) - self.centres.unsqueeze(-1)).square()
-            square = (apart * torch.exp(-2.0 * self.log_widths).unsqueeze(-1)).sum(2)
-            return torch.exp(-0.5 * square)
+            return torch.exp(-0.5 * self._apart(x).square().sum(2))
         constant, quadratic, powers = self._expanded(x)
         exponents = torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
         return torch.exp(exponents)
+
+    def _apart(self, x: Tensor) -> Tensor:
+        """Distances from the centres in widths, (groups, units, inputs, samples)."""
+        apart = grouped.to_columns(x).unsqueeze(1) - self.centres.unsqueeze(-1)
+        return apart * torch.exp(-self.log_widths).unsqueeze(-1)
 
     def _expanded(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Constants, coefficients and powers of the inputs, whose product gives the exponents.
@@ -212,6 +220,8 @@ class RBFNetwork(grouped.LinearOutputModule):
             x: inputs, shape (*batch, groups, inputs).
             y: desired outputs, shape (*batch, groups, outputs).
             width: of every unit, relative to the standard deviation of each input.
+        Raises:
+            ValueError: if there are too few samples, an input never varies, or targets do not fit.
         """
         samples = self._samples(x)
         targets = grouped.targets_of(x, y, self.outputs)
@@ -230,6 +240,8 @@ class RBFNetwork(grouped.LinearOutputModule):
             y: desired outputs, shape (*batch, groups, outputs).
             prior_precision: relative to the noise precision; a number or broadcastable to (groups,
                 units + 1).
+        Raises:
+            ValueError: if targets are not finite or do not fit the inputs.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
         targets = grouped.targets_of(x, y, self.outputs)
@@ -304,7 +316,8 @@ class AnfisRBF(nn.Module):
         """Fit the head's output layer to the ANFIS's residual of `y` by least squares."""
         carried = self.anfis(x)
         # On the residual, so that the rules keep their meaning.
-        self.head.solve_output(torch.cat([x, carried], -1), y - carried, prior_precision)
+        left = grouped.targets_of(x, y, self.outputs).view_as(carried) - carried
+        self.head.solve_output(torch.cat([x, carried], -1), left, prior_precision)
 
 
 def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:

@@ -23,6 +23,7 @@ from nfriction import (
     fit,
     rollout,
 )
+from nfriction.fitting import diagnosis
 from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
@@ -208,9 +209,21 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
-@pytest.mark.parametrize("change", [0.0, 0.3])
-def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(change):
+# If a line through the estimates changes its sign, something else has changed.
+@pytest.mark.parametrize(
+    ("change", "times", "named"), [(0.0, 1, False), (0.3, 1, True), (0.3, 10, False)]
+)
+def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
+    change, times, named, monkeypatch
+):
     """With another motion in each."""
+
+    def growth(*given):
+        found, squares = estimated(*given)
+        return times * found, squares
+
+    estimated = diagnosis._growth
+    monkeypatch.setattr(diagnosis, "_growth", growth)
     recordings, rng = [], np.random.default_rng(0)
     time = 0.004 * np.arange(2001)[:, None]
     for number, rate in enumerate((1.3, 1.7, 2.3, 1.9)):
@@ -225,10 +238,10 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(cha
         recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
     said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
-    assert len(said) == (change > 0)
+    assert len(said) == named
     for sentence in said:
-        named = re.search(r"grows by (\S+) % \(within (\S+) %\) in run2 relative to", sentence)
-        found, within = map(float, named.groups())
+        numbers = re.search(r"grows by (\S+) % \(within (\S+) %\) in run2 relative to", sentence)
+        found, within = map(float, numbers.groups())
         assert abs(found - 30) < within < 5
 
 
@@ -390,6 +403,22 @@ def test_a_spring_that_the_rig_lacks_is_named(name, stiffness):
     found = float(re.search(r"joint1 has a spring of (\S+) N", named)[1])
     assert found == pytest.approx(stiffness, rel=0.02)
     assert warnings_of(plant, q, tau) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "share"), [("wheel", 7, 0.2), ("wheel", 84, 0.2), ("driven", 7, 0.5)]
+)
+def test_cogging_is_named(name, rate, share):
+    """The drive has to balance it, in addition to the torque of the same motion without it."""
+    plant, q, tau = measured(name)
+    assert tau is not None
+    size = share * np.sqrt(np.mean(tau[:, -1] ** 2))
+    q = q[:, -1:]
+    wave = np.pad(size * np.sin(rate * q + 1.0), ((0, 0), (tau.shape[1] - 1, 0)))
+    (found,) = warnings_of(plant, measured(name)[1], tau + wave)
+    named = f"joint{plant.joints} has a torque of (\\S+) N m that repeats {rate} times per turn"
+    (seen,) = re.findall(named, found)
+    assert float(seen) == pytest.approx(size, rel=0.2)
 
 
 @pytest.mark.parametrize("inertia", [0.002, 0.02, 2.0])

@@ -196,7 +196,7 @@ def test_unsound_sizes_and_samples_are_refused() -> None:
         network.init_range(1.0, 0.0)
     targets = surface(x)
     for y in (targets.squeeze(1).T, targets[:40], torch.full_like(targets, torch.nan)):
-        for place in (network.solve_output, network.init_ols):
+        for place in (network.solve_output, network.init_ols, AnfisRBF(1, 2, [2, 2], 2).solve_head):
             with pytest.raises(ValueError, match="must be finite and of shape"):
                 place(x, y)
 
@@ -213,3 +213,5 @@ def test_narrow_units_are_right_in_single_precision(width: float) -> None:
         found = getattr(single, form)(x.float())
         assert found.dtype == torch.float32
         torch.testing.assert_close(found.double(), getattr(network, form)(x), rtol=1e-4, atol=1e-6)
+    slopes = single.input_jacobian(x.float()).double()
+    torch.testing.assert_close(slopes, network.input_jacobian(x), rtol=1e-3, atol=0.0)

@@ -227,7 +227,8 @@ def in_joint_coordinates(
         if joints != plant.joints or joints != modelled:
             raise ValueError(
                 f"recording, plant and model must have equally many joints, got {joints} in "
-                f"{recording.name}, {plant.joints} and {modelled}."
+                f"{recording.name} (positions are columns q1, q2, ... or those that `columns` "
+                f"names), {plant.joints} and {modelled}."
             )
     conventions = {str(r.resolve_convention(plant)) for r in recordings}
     # Residuals are formed in recorded coordinates, with one matrix for all windows.

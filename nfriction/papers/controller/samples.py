@@ -117,19 +117,25 @@ def build_samples(
 def read_samples(
     folder: str | os.PathLike[str], joint_names: Sequence[str] = ("joint2", "joint3", "joint4")
 ) -> ControllerSamples:
-    """Samples from the folder to which `build_samples` wrote them; ValueError if changed since."""
+    """Samples from the folder to which `build_samples` wrote them.
+
+    Raises:
+        ValueError: if they were changed since, or tables of one's own lack columns, differ in time
+            or have cells that are no finite numbers.
+    """
     folder = Path(folder)
     tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
     outputs = tuple(name for name in map(str, tables[0]) if name not in ("time", *INPUTS))
     for name, table in zip(joint_names, tables, strict=True):
-        wanted = {"time", *INPUTS, *outputs}
-        sound = {*table} == wanted and len(table) == len(tables[0]) and outputs
-        if not sound or not np.isfinite(table.to_numpy(dtype=np.float64)).all():
-            raise ValueError(
-                f"{folder / name}.csv.gz needs the columns time, {', '.join(INPUTS)} and outputs, "
-                f"finite and as long as those of {joint_names[0]}; got "
-                f"{', '.join(map(str, table))} and {len(table)} rows."
-            )
+        where, wanted = f"{folder / name}.csv.gz", ["time", *INPUTS, *outputs]
+        if {*table} != {*wanted} or not outputs:
+            columns = ", ".join(map(str, table))
+            raise ValueError(f"{where} needs the columns {', '.join(wanted)}, got {columns}.")
+        cells = table.apply(pd.to_numeric, errors="coerce")
+        if not len(cells) or not np.isfinite(cells).all(axis=None):
+            raise ValueError(f"{where} needs rows of finite numbers only.")
+        if not table["time"].equals(tables[0]["time"]):
+            raise ValueError(f"{where} needs the times of {joint_names[0]}.")
     x, y = (
         torch.tensor(np.stack([table[list(names)].to_numpy() for table in tables], 1))
         for names in (INPUTS, outputs)

@@ -7,8 +7,8 @@ coefficient's scale s_k, a joint's torque is f . w with f_ku = g_k s_k phi_u, an
     w += P f e / (l r^2 + f'P f),    P = (P - P f f'P / (l r^2 + f'P f)) / l
 
 given the torque error e, its standard deviation r and the forgetting factor l. The coefficients are
-bounded by a margin around the trained ones, the covariance P by its initial trace, and an error by
-three of its standard deviations (Huber's loss), so that an outlier moves little.
+bounded by a margin around the trained ones, the covariance P by its initial trace, and the measured
+torque by what coefficients within these bounds can give, so that an outlier moves little.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.version import __version__
 
 TEMPLATES = ("nfriction.papers.nffem",)
-# Standard deviations from which an error counts as an outlier, as by the three-sigma rule.
-OUTLIER = 3.0
 
 
 @dataclass(frozen=True)
@@ -128,15 +126,18 @@ class OnlineNetwork:
             torch.where(known, x, torch.zeros_like(x)) for x in (qd, qdd, load, measured)
         )
         phi = self._regressors(qd, qdd)
-        torque, slopes = law_slopes(self.model, qd, load, self._coefficients(phi), self.learnt)
+        coefficients = self._coefficients(phi)
+        torque, slopes = law_slopes(self.model, qd, load, coefficients, self.learnt)
+        # Friction of other coefficients, at most; the rest depends on none that learns.
+        largest = (slopes.abs() * torch.maximum(self.least.abs(), self.most.abs())).sum(-1)
+        largest = largest + (torque - (slopes * coefficients).sum(-1)).abs()
+        measured = torch.minimum(torch.maximum(measured, -largest), largest)
         f = ((slopes * self.scale).unsqueeze(-1) * phi.unsqueeze(-2)).flatten(-2)
         pf = (self.covariance @ f.unsqueeze(-1)).squeeze(-1)
         spread = options.forget * options.noise**2 + (pf * f).sum(-1, keepdim=True)
         # An overflow of a huge input would never leave the weights.
         known = known & (spread.squeeze(-1) < math.inf)
-        most = OUTLIER * spread.squeeze(-1).sqrt()
-        error = torch.minimum(torch.maximum(measured - torque, -most), most)
-        move = (pf / spread * error.unsqueeze(-1)).view_as(self.weight)
+        move = (pf / spread * (measured - torque).unsqueeze(-1)).view_as(self.weight)
         left = self.covariance - pf.unsqueeze(-1) * (pf / spread).unsqueeze(-2)
         trace = left.diagonal(dim1=-2, dim2=-1).sum(-1) / options.forget
         # Without this, the covariance would grow without bound in directions that are not excited.
@@ -197,7 +198,7 @@ def write_online(
         "name": name, "model": type(model).__name__, "version": __version__,
         "joints": model.joints, "coefficients": len(model.law.names), "units": network.units,
         "along_motion": schedule.along_motion, "turn": schedule.turn, "law": law, "torque": torque,
-        "outlier": OUTLIER, "variance": options.spread**2, "noise_variance": options.noise**2,
+        "variance": options.spread**2, "noise_variance": options.noise**2,
         "forget": options.forget, "slowest": options.slowest, "forgetting": options.forgetting,
         "sample_time": options.sample_time,
         "table": lambda key, *sizes: dialect.table(key, values[key].detach(), *sizes),

@@ -169,11 +169,12 @@ def train_network(
 
     Raises:
         TypeError: if network and samples are not in double precision.
-        ValueError: if samples do not match the network, are not finite or mostly beyond its sets or
-            units, or an input never varies.
+        ValueError: if samples do not match the network, are not finite or span over ten times the
+            range of its sets or units, or an input never varies.
     """
     _check(network, x, y)
     scaling = Scaling.of(x, y)
+    _check_range(network, x)
     x, y = scaling.inputs(x), scaling.outputs(y)
     groups = [NetworkGroup(network, g, scaling, x, y) for g in range(network.groups)]
     # All groups get a usable network before the long part, which may be interrupted.
@@ -234,14 +235,17 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
         raise TypeError(
             "a network is trained in double precision: `network.double()`, `x.double()`."
         )
+
+
+def _check_range(network: FuzzyNetwork, x: Tensor) -> None:
     # A new network has its sets or units within [-1, 1].
     lower, upper = _reach(network.anfis if isinstance(network, AnfisRBF) else network)
     least, most = x.amin(0), x.amax(0)
     covered = torch.minimum(upper, most) - torch.maximum(lower, least)
     if (covered < 0.1 * (most - least)).any():
         raise ValueError(
-            "the network's sets or units cover less than a tenth of the range of an input; place "
-            "them first: `init_grid(x.amin(0), x.amax(0))` or `init_kmeans(x)`."
+            "the network's sets or units cover less than a tenth of the range of an input; drop "
+            "outliers, or place them first: `init_grid(x.amin(0), x.amax(0))`, `init_kmeans(x)`."
         )
 
 

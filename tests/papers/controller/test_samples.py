@@ -62,8 +62,15 @@ def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Pat
               for name, table in tables.items()}  # fmt: skip
     torch.testing.assert_close(read(**turned).y, first.y)
     table = tables["joint3"]
-    for wrong in (table.rename(columns={"speed": "velocity"}), table[:-1], table.assign(B=np.nan)):
-        with pytest.raises(ValueError, match=r"joint3.csv.gz needs the columns time, speed, acc"):
+    for wrong, fault in (
+        (table.rename(columns={"speed": "velocity"}), "the columns time, speed, acceleration, B"),
+        (table.assign(B=np.nan), "rows of finite numbers"),
+        (table.assign(B="x"), "rows of finite numbers"),
+        (table[:0], "rows of finite numbers"),
+        (table[:-1], "the times of joint2"),
+        (table.assign(time=2 * table["time"]), "the times of joint2"),
+    ):
+        with pytest.raises(ValueError, match=f"joint3.csv.gz needs {fault}"):
             read(joint3=wrong)
 
 

@@ -222,6 +222,8 @@ def test_misfits_are_refused_at_the_border() -> None:
     for made in (Anfis(1, 2, [2, 2], 2), RBFNetwork(1)):
         with pytest.raises(ValueError, match="cover less than a tenth of the range of an input"):
             train_network(made, 1000 * x + 500, surface(x))
+        with pytest.raises(ValueError, match="vary"):
+            train_network(made, x * torch.tensor([1.0, 0.0]) + 500.0, surface(x))
     with pytest.raises(TypeError, match="Linear"):
         train_network(nn.Linear(2, 2), x, surface(x))
     with pytest.raises(ValueError, match="controllers"):
