@@ -102,7 +102,7 @@ def _data(
     if not isinstance(adaptive.schedule, Adaptive) or adaptive.joints != len(samples.joint_names):
         raise ValueError(
             f"--adaptive needs an adaptive model of {len(samples.joint_names)} joints, "
-            f"{given.adaptive} holds {type(adaptive).__name__} with {adaptive.joints}."
+            f"{given.adaptive} contains {type(adaptive).__name__} with {adaptive.joints} joints."
         )
     speed, acceleration = samples.x.unbind(-1)
     motion = Motion(samples.time, *(x.numpy() for x in (speed, speed, acceleration)))

@@ -103,7 +103,7 @@ def verify_artefact(
     except ExportError as error:
         if not differences:
             raise
-        raise ExportError(f"{error} It belongs to another model: {differences[0]}.") from None
+        raise ExportError(f"{path} belongs to another model: {differences[0]}. {error}") from None
     try:
         # First, because this refuses outputs of another law by their shapes.
         at_points = compare(controller.run(*inputs), run(*inputs), own.tolerance, own.scales)

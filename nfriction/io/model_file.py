@@ -293,7 +293,8 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         try:
             content = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise ValueError(f"not a model file, or cut short ({error}).") from error
+            binary = "it is binary, as an artefact is" * isinstance(error, UnicodeDecodeError)
+            raise ValueError(f"not a model file, or cut short ({binary or error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError("not a model file of nfriction.")
         if content.get("schema") != SCHEMA:

@@ -92,7 +92,7 @@ def test_metadata_cannot_loosen_the_tolerance(
 
 def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
     with pytest.raises(
-        ExportError, match=r"It belongs to another model: model LFM instead of NLFM\."
+        ExportError, match=r"pt belongs to another model: model LFM instead of NLFM\."
     ):
         verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 

@@ -287,7 +287,7 @@ def test_layout_is_no_damage(tmp_path: Path) -> None:
     ("written", "message"),
     [
         (b"", "not a model file, or cut short"),
-        (b"\x80\x04\x95", "not a model file, or cut short"),
+        (b"\x80\x04\x95", "cut short .it is binary, as an artefact is"),
         (b"\xff\xfe\x00", "not a model file, or cut short"),
         (b"[]", "not a model file of nfriction"),
         (b'{"format": "other"}', "not a model file of nfriction"),
