@@ -157,7 +157,9 @@ def likely_mistakes(
         unlike = [] if zeroed else unlike
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
-    rare = *_springs(plant, given), *_geared(plant, convention, given), *_cogging(plant, given)
+    rare = [*_springs(plant, given), *_geared(plant, convention, given)]
+    if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
+        rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
     explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
     found = [Mistake(text, share) for text, share in (*unlike, *explain)]
