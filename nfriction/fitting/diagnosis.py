@@ -38,7 +38,7 @@ FEWEST_BLOCKS = 20
 ALIKE = 0.1
 # Logarithms of the ratios between which gears of robots lie.
 LOG_RATIOS = math.log(1.5), math.log(300.0)
-# Slots and poles of a motor have a least common multiple of at most about this.
+# Cogging repeats with the least common multiple of slots and poles, at most about this.
 MOST_PER_TURN = 300
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5

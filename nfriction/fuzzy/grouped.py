@@ -99,7 +99,7 @@ class LinearOutputModule(nn.Module):
 
 
 def targets_of(x: Tensor, y: Tensor, outputs: int) -> Tensor:
-    """Targets as (samples, groups, outputs); ValueError if not finite or not as many as `x`."""
+    """Targets as (samples, groups, outputs); ValueError unless finite and of the batch of `x`."""
     if y.shape != (*x.shape[:-1], outputs) or not bool(torch.isfinite(y).all()):
         raise ValueError(
             f"targets of inputs {tuple(x.shape)} must be finite and of shape "

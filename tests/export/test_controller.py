@@ -154,7 +154,7 @@ def test_the_filter_survives_lost_samples(name: str, lost: int) -> None:
     q[400 : 400 + lost, 0] = math.inf
     q[0, 1] = math.nan  # an encoder that is not ready yet
     tau_f, _, status = controller.run(q, torch.ones_like(q))
-    # A velocity takes two positions in a row.
+    # A velocity needs two positions in a row.
     bad = torch.zeros_like(status, dtype=torch.bool)
     bad[400 : 401 + lost, 0] = bad[:2, 1] = True
     assert torch.equal(status == NOT_FINITE, bad)

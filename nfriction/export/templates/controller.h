@@ -90,7 +90,7 @@ void nf_filter_init(nf_filter *filter, const double q[NF_JOINTS]);
 void nf_filter_reset(nf_filter *filter, const double q[NF_JOINTS]);
 
 /* Velocity and acceleration after one more sample; call once per sample time. A position that is
- * not finite gives NaN, and so does the next one, because a velocity takes two in a row. */
+ * not finite gives NaN, and so does the next one, because a velocity needs two in a row. */
 void nf_filter_step(
     nf_filter *filter, const double q[NF_JOINTS], nf_real qd[NF_JOINTS], nf_real qdd[NF_JOINTS]);
 

@@ -49,8 +49,8 @@ def delay_warning(
     """A sentence on the torque delay that the data indicate, and whether friction depends on it.
 
     A delay below one sample is hardly visible in the torque balance. A wrong law also looks like a
-    delay; friction depends on it only if fitting it moves a coefficient out of its interval, and a
-    shorter delay than one sample that moves none is not worth a sentence.
+    delay; friction depends on it only if fitting it moves a coefficient out of its interval. One
+    below a sample that moves none is not reported.
     """
     late = richer_by_evidence(found, delayed, "delay of the torque")
     fall = 0 if late is None else round(100 * (1 - late.rms / found.rms))

@@ -121,7 +121,7 @@ def read_samples(
 
     Raises:
         ValueError: if they were changed since, or tables of one's own lack columns, differ in time
-            or have cells that are no finite numbers.
+            or contain cells that are not finite numbers.
     """
     folder = Path(folder)
     tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
