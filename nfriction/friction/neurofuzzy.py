@@ -381,7 +381,8 @@ class NeuroFuzzy(Schedule):
         by_head = head.input_jacobian(both).permute(3, 0, 1, 2)
         # The outputs of the rules are also inputs of the head.
         by_input, by_y = by_head.tensor_split([x.shape[-1]], -1)
-        by_x = anfis.input_jacobian(x).permute(3, 0, 1, 2)
+        columns = anfis.jacobian_columns(x)
+        by_x = anfis.input_jacobian(x, columns).permute(3, 0, 1, 2)
         by_x = (by_x + by_input + by_y @ by_x) * weight[..., None]
         # A clamped input no longer affects the network itself, only the weight of its output.
         by_x = torch.where((beyond == 0.0).unsqueeze(-2), by_x, 0.0)
@@ -401,24 +402,25 @@ class NeuroFuzzy(Schedule):
             own = torch.eye(len(self.fitted_mask), self.outputs, dtype=y.dtype, device=y.device)
             through, direct = pad(by_y, [0, 0, 0, self.unvaried]), (by_u * weight)[..., None]
             by_rules, by_weights = direct * (own + through), direct * own
+            shared = anfis.consequents[0, 0].numel()
+            rules = by_rules, columns[:, :shared].movedim(-1, 0)
             if not self.learn_sets:
-                return (by_rules, anfis.regressors(x)), (by_weights, head.activations(both))
-            columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
-            shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
-            by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
-            by_unit = by_weights @ head.output_weight.repeat_interleave(head.inputs, -1)
+                return rules, (by_weights, head.activations(both))
+            units = head.jacobian_columns(both)
+            by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1))
             # Derivatives of a unit's output by its centre and log width, both over the squared
             # width.
-            moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
+            moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).permute(3, 0, 1, 2)
             moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
+            by_unit = head.output_weight.repeat_interleave(head.inputs, -1)
             return (
-                (by_rules, columns[:, :shared].movedim(-1, 0)),
+                rules,
                 (by_weights, units[:, : head.units].movedim(-1, 0)),
                 *(
-                    (by_rules @ (by_set @ rows), one)
+                    (by_rules, (rows.mT.unsqueeze(1) @ by_set).permute(3, 0, 1, 2))
                     for rows in anfis.partition.jacobian().values()
                 ),
-                *((by_unit * part.unsqueeze(2), one) for part in moved.unbind(2)),
+                *((by_weights, by_unit * part.unsqueeze(2)) for part in moved.unbind(2)),
             )
 
         return Sensitivity(factors, by_qd, by_qdd)

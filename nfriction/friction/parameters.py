@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from inspect import signature
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -92,14 +93,16 @@ def require_options(
 class Sensitivity:
     """Derivatives of the coefficients at given motions.
 
-    A parameter affects the coefficients of only one joint. The parameters form groups, each of
-    shape (joint, output, feature): an output is a sum of features weighted by the parameters, so
-    the derivative is an outer product, which is stored as its two factors.
+    A parameter affects the coefficients of only one joint. The parameters form groups: outputs are
+    sums of features weighted by the parameters, so the derivative is a product, which is stored as
+    its two factors. The outputs share the features and have parameters (joint, output, feature), or
+    share the parameters (joint, feature) and have features of their own.
 
     Attributes:
         factors: computes, for each group, the derivatives of the coefficients with respect to the
             outputs, (sample, joint, coefficient, output), and the features, (sample, joint,
-            feature); most of the work, and not needed for derivatives by the motion alone.
+            feature) or (sample, joint, output, feature); most of the work, and not needed for
+            derivatives by the motion alone.
         qd: with respect to the joint's own velocity, (sample, joint, coefficient).
         qdd: with respect to the joint's own acceleration, (sample, joint, coefficient).
     """
@@ -118,16 +121,19 @@ class Sensitivity:
         """
         count = by_parameter.shape[-2]
         zero = by_parameter.new_zeros(()).expand(*motion.shape, count)
-        # The parameters share nothing, so their only feature is 1.
-        one = by_parameter.new_ones(()).expand(*motion.shape, 1)
+        one = torch.eye(count).to(by_parameter).expand(*motion.shape, -1, -1)
         whole = by_parameter.expand(*motion.shape, count, -1)
-        return cls(lambda: ((whole, one),), zero, zero)
+        return cls(lambda: ((one, whole),), zero, zero)
 
     @property
     def parameters(self) -> Tensor:
         """Full derivative by the parameter vector, (sample, coefficient, parameter)."""
         # Large, but only computed for short segments; sums over a motion use `contract`.
-        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors()]
+        shared, own = "sjko,sjf->skjof", "sjko,sjof->skjf"
+        whole = [
+            torch.einsum(shared if features.ndim == 3 else own, mix, features).flatten(2)
+            for mix, features in self.factors()
+        ]
         return torch.cat(whole, -1)
 
     @property
@@ -136,34 +142,37 @@ class Sensitivity:
         rows = []
         for mix, features in self.factors():
             joints = torch.arange(mix.shape[1], device=mix.device)
-            rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
+            outputs = mix.shape[-1] if features.ndim == 3 else 1
+            rows.append(joints.repeat_interleave(outputs * features.shape[-1]))
         return torch.cat(rows)
 
-    def contract(self, cotangent: Tensor) -> Tensor:
-        """Parameter derivatives of quantities that depend on the coefficients.
+    # A search rejects derivatives that overflow; a warning would be noise.
+    @np.errstate(over="ignore", invalid="ignore")
+    def contract(self, cotangent: Tensor, out: Tensor) -> None:
+        """Write the parameter derivatives of quantities that depend on the coefficients.
 
         Args:
             cotangent: derivatives with respect to the coefficients at many samples, (block, row,
                 sample, joint, coefficient); the blocks contain this sensitivity's samples in order.
-
-        Returns:
-            Shape (block, row, parameter).
+            out: receives the derivatives, (block, row, parameter).
         """
-        blocks, rows, samples = cotangent.shape[:3]
-        found = [cotangent.new_zeros(blocks, rows, 0)]
-        for mix, features in self.factors():
+        blocks, _, samples = cotangent.shape[:3]
+        by_sample, place, groups = cotangent.permute(0, 2, 3, 1, 4), 0, self.factors()
+        # Groups often have the same outputs. (block, joint, row, sample, output)
+        mixes = {id(mix): mix.unflatten(0, (blocks, samples)) for mix, _ in groups}
+        mixed = {k: (by_sample @ mix).permute(0, 2, 3, 1, 4) for k, mix in mixes.items()}
+        for mix, features in groups:
+            joints, outputs, count = mix.shape[1], mix.shape[-1], features.shape[-1]
+            shape = (joints, outputs, count) if features.ndim == 3 else (joints, count)
+            columns = slice(place, place := place + math.prod(shape))
+            # (block, joint, row, ...); NumPy's products write there, those of torch are copied.
+            found = out[..., columns].unflatten(-1, shape).transpose(1, 2)
             constant = mix.stride(0) == features.stride(0) == 0  # over the samples
-            mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
-            if constant and features.shape[-1] == 1:
-                both = cotangent.sum(2).transpose(1, 2) @ (mix[0, 0] * features[0, 0, ..., None])
-            elif features.shape[-1] == 1:
-                # No shared features: one product over samples and coefficients is faster.
-                by_parameter = (mix * features[..., None]).transpose(1, 2).flatten(2, 3)
-                both = cotangent.permute(0, 3, 1, 2, 4).flatten(3) @ by_parameter
+            left, right = mixed[id(mix)], features.unflatten(0, (blocks, samples)).transpose(1, 2)
+            if features.ndim == 3:
+                left, right = left.mT, right.unsqueeze(2)
+            elif constant:
+                left, right = left.sum(3), right[0, :, 0]
             else:
-                # (block, joint, row and output, sample) by (block, joint, sample, feature).
-                mixed = cotangent.permute(0, 2, 3, 1, 4) @ mix
-                left = mixed.permute(0, 2, 3, 4, 1).flatten(2, 3)
-                both = (left @ features.transpose(1, 2)).unflatten(2, (rows, -1))
-            found.append(both.transpose(1, 2).flatten(2))
-        return torch.cat(found, -1)
+                left, right = left.flatten(3), right.flatten(2, 3)
+            np.matmul(left.numpy(), right.numpy(), out=found.numpy())

@@ -212,10 +212,11 @@ class Anfis(LinearOutputModule):
         return F
 
     @torch.no_grad()
-    def input_jacobian(self, x: Tensor) -> Tensor:
+    def input_jacobian(self, x: Tensor, columns: Tensor | None = None) -> Tensor:
         """In closed form: the rules' slopes, and Q dlog m / dx of the sets (`jacobian_columns`)."""
         shared, own = self._column_counts
-        rules, by_set = self.jacobian_columns(x).tensor_split([shared], 1)
+        columns = self.jacobian_columns(x) if columns is None else columns
+        rules, by_set = columns.tensor_split([shared], 1)
         # An input has the opposite effect of the centres of its sets.
         by_centre = by_set.unflatten(1, (self.outputs, own))[:, :, : sum(self.terms)]
         by_input = (by_centre / self.sets()[1][:, None, :, None]).split(self.terms, 2)

@@ -260,14 +260,19 @@ def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, sets:
     assert not found.parameters.requires_grad
 
 
-def test_factored_sensitivities_are_contracted_as_if_multiplied_out() -> None:
-    schedule = trained(NONLINEAR, 2, terms=(3, 2), head_units=4)
+@pytest.mark.parametrize("learnt", [False, True])
+def test_factored_sensitivities_are_contracted_as_if_multiplied_out(learnt: bool) -> None:
+    schedule = trained(NONLINEAR, 2, terms=(3, 2), head_units=4, learn_sets=learnt)
     qd, qdd, _ = motion(6, 2)
     found = schedule.sensitivities(qd, qdd)
     held = torch.randn(3, 4, 2, 2, 5, generator=torch.Generator().manual_seed(3), dtype=qd.dtype)
     whole, samples = found.parameters.unflatten(0, (3, 2)), held[..., found.joint, :]
     expected = torch.einsum("bskp,brspk->brp", whole, samples)
-    torch.testing.assert_close(found.contract(held), expected, rtol=1e-12, atol=1e-14)
+    # Part of a larger array, whose other columns stay.
+    whole = torch.full((3, 4, expected.shape[-1] + 2), 7.0, dtype=qd.dtype)
+    found.contract(held, whole[..., :-2])
+    torch.testing.assert_close(whole[..., :-2], expected, rtol=1e-12, atol=1e-14)
+    assert (whole[..., -2:] == 7.0).all()
 
 
 def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Tensor:

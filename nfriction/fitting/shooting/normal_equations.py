@@ -13,6 +13,7 @@ References:
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -35,14 +36,18 @@ def scaled_rows(
             # An encoder offset shifts both the initial position and the measured ones.
             measured = torch.eye(joints, dtype=torch.float64)
             rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
-        scaled = (measurement @ rows) * scale[:, part, :, None]
-        yield part, scaled.flatten(1, 2)
+        observed = measurement * scale[:, part, :, None]
+        yield part, product(observed, rows).flatten(1, 2)
 
 
-def gram(rows: Tensor) -> Tensor:
-    """Products of all pairs of columns; NumPy, unlike torch, computes each pair once."""
-    columns = rows.numpy()
-    return torch.from_numpy(columns.T @ columns)
+def product(left: Tensor, right: Tensor) -> Tensor:
+    """Matrix product by NumPy, which multiplies many small matrices several times as fast as torch.
+
+    It computes each pair of a matrix and its own transpose once.
+    """
+    # The search rejects a step at which derivatives overflow; a warning would be noise.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return torch.from_numpy(left.numpy() @ right.numpy())
 
 
 def normal_equations(
@@ -53,17 +58,15 @@ def normal_equations(
     shared = int(indices[0, 0])
     gradient = torch.zeros(size, dtype=torch.float64)
     hessian = torch.zeros(size, size, dtype=torch.float64)
-    slope = torch.zeros(windows, count, dtype=torch.float64)
-    mixed = torch.zeros(windows, count, shared, dtype=torch.float64)
-    curvature = torch.zeros(windows, count, count, dtype=torch.float64)
+    slope = torch.zeros(windows, shared + count, dtype=torch.float64)
+    by_own = torch.zeros(windows, count, shared + count, dtype=torch.float64)
     for part, scaled in rows:
-        common, own = scaled.split([shared, count], -1)
-        errors, flat = r[:, part].flatten(1), common.flatten(0, 1)
-        gradient[:shared] += errors.flatten() @ flat
-        hessian[:shared, :shared] += gram(flat)
-        slope += (errors[:, None] @ own)[:, 0]
-        mixed += own.mT @ common
-        curvature += own.mT @ own
+        common = scaled[..., :shared].flatten(0, 1)
+        hessian[:shared, :shared] += product(common.mT, common)
+        slope += (r[:, part].flatten(1)[:, None] @ scaled)[:, 0]
+        by_own += product(scaled[..., shared:].mT, scaled)
+    gradient[:shared] = slope[:, :shared].sum(0)
+    slope, (mixed, curvature) = slope[:, shared:], by_own.split([shared, count], -1)
     places, common = indices[:, :, None], torch.arange(shared)
     gradient.index_put_((indices,), slope, accumulate=True)
     hessian.index_put_((places, common), mixed, accumulate=True)
@@ -97,7 +100,8 @@ class Kept:
     def squares(self, rows: Tensor) -> Tensor:
         """J^T J of rows (window, row, column) without states, (kept, kept)."""
         if self.shared == rows.shape[-1]:
-            return gram(rows.flatten(0, 1))
+            columns = rows.flatten(0, 1)
+            return product(columns.mT, columns)
         total = torch.zeros(self.count, self.count, dtype=torch.float64)
         at = self._places()
         return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)

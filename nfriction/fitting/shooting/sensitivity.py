@@ -151,8 +151,8 @@ def propagate(
     windows, steps = run.step.shape
     joints, state = run.motion.q.shape[-1], run.state
     parameters = run.friction.schedule.parameter_vector().numel()
-    friction_count, plant_count = (0, 0) if states else (parameters, len(run.plant_vector))
-    shared = friction_count + plant_count
+    counts = (0, 0) if states else (parameters, len(run.plant_vector))
+    shared, friction_count = sum(counts), counts[0]
     own = state.shape[-1]
     carried = torch.zeros(windows, own + joints, shared + own, dtype=torch.float64)
     carried[:, :own, shared:] = torch.eye(own, dtype=torch.float64)
@@ -164,7 +164,7 @@ def propagate(
     carried[:, own:, motion], by_plant = jacobian.initial_acceleration(
         run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
     ).tensor_split([2 * joints], -1)
-    carried[:, own:, friction_count:shared] = by_plant[..., :plant_count]
+    carried[:, own:, friction_count:shared] = by_plant[..., : counts[1]]
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
@@ -180,8 +180,7 @@ def propagate(
         slope = replace(slope, factors=tuple) if states else slope
         derivative = jacobian.after_step(before, held, tau, step, run.plant_vector)
         by_state, by_shared = (
-            part.unflatten(0, (-1, windows))
-            for part in _compose(slope, derivative, length, plant_count)
+            part.unflatten(0, (-1, windows)) for part in _compose(slope, derivative, length, counts)
         )
         rows, carried = _carry(by_state, by_shared, carried, joints)
         end = sample + stride * rows.shape[1]
@@ -209,16 +208,17 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, counts: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    Returns derivatives of the ends of blocks with respect to the state before and shared variables.
+    Returns derivatives of the ends of blocks with respect to the state before and shared variables,
+    of which `counts` are of friction and plant.
     """
     samples, joints, k = slope.qd.shape
     own = derivative.shape[-2] - joints
     by_own, by_held, by_plant = derivative.tensor_split([own, own + joints * k], -1)
-    by_plant = by_plant[..., :plant_count]
+    by_plant = by_plant[..., : counts[1]]
     of_joint = by_held.unflatten(-1, (joints, k))
     by_q, by_qd, by_law = by_own.tensor_split([joints, 2 * joints], -1)
     by_motion = torch.stack([slope.qd, slope.qdd], -1)
@@ -234,7 +234,11 @@ def _compose(
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
-    return after, torch.cat([slope.contract(by_coefficient), total], -1)
+    shared = total.new_empty(*total.shape[:-1], sum(counts))
+    by_friction, by_terms = shared.split(counts, -1)
+    slope.contract(by_coefficient, by_friction)
+    by_terms.copy_(total)
+    return after, shared
 
 
 def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -246,12 +250,12 @@ def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tu
     state, shared = by_state.numpy(), by_shared.numpy()
     before = start.numpy().copy()
     after = np.empty_like(before)
-    rows = np.empty((len(state), len(before), count, before.shape[-1]))
+    rows = np.empty((len(before), len(state), count, before.shape[-1]))
     # The search rejects a step at which derivatives overflow; a warning would be noise.
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(len(state)):
-            rows[k] = before[:, :count]
+            rows[:, k] = before[:, :count]
             np.matmul(state[k], before, out=after)
             after[..., : shared.shape[-1]] += shared[k]
             before, after = after, before
-    return torch.from_numpy(rows).transpose(0, 1), torch.from_numpy(before)
+    return torch.from_numpy(rows), torch.from_numpy(before)
