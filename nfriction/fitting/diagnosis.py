@@ -21,6 +21,7 @@ from torch import Tensor
 from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_buffers, adjusted_plant
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
@@ -61,8 +62,8 @@ class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
 
     `sd` is that of the smoothed accelerations [rad/s²] and `sd_of_mean` that of their block means,
-    zero if they are unknown. `time` counts from the start of a recording [s], (sample, 1), and
-    `number` the recordings.
+    zero if they are unknown. `turns` is 1 where a joint's velocity exceeds its noise, else 0. `time`
+    counts from the start of a recording [s], (sample, 1), and `number` the recordings.
     """
 
     q: Tensor
@@ -70,6 +71,7 @@ class _Data:
     qdd: Tensor
     sd: Tensor
     sd_of_mean: Tensor
+    turns: Tensor
     tau: Tensor
     time: Tensor
     number: Tensor
@@ -89,7 +91,7 @@ class _Data:
 
         Dry friction can have any value at rest, so the balance shows nothing there.
         """
-        return (self.mean(torch.sign(self.qd)).abs() == 1).to(self.qd)
+        return (self.mean(self.turns * torch.sign(self.qd)).abs() == 1).to(self.qd)
 
     @cached_property
     def friction(self) -> Tensor:
@@ -414,16 +416,17 @@ def _collect(
         torque = recording.torque_at(stamps[at] + delay + drift * since)
         of = since[:, None], np.full((len(at), 1), k)
         noise = noise_of_mean = 0 * torque
+        turns = np.ones_like(torque)
         if motion.std is not None:
             noise = motion.std.qdd[at]
             # A mean acceleration is a difference of velocities, too.
             over = max(1, block - 1) * recording.sample_time
             noise_of_mean = np.minimum(noise, math.sqrt(2) / over * motion.std.qd[at])
+            turns[np.abs(motion.qd[at]) <= NORMAL_95 * motion.std.qd[at]] = 0.0
         moved = motion.q[at], motion.qd[at], motion.qdd[at]
-        parts.append((*moved, noise, noise_of_mean, torque, *of))
+        parts.append((*moved, noise, noise_of_mean, turns, torque, *of))
     found = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    q, qd, qdd, sd, sd_of_mean, tau, time, number = found
-    return _Data(q, qd, qdd, sd, sd_of_mean, tau, time, number, block)
+    return _Data(*found, block)
 
 
 def _corrected_positions(

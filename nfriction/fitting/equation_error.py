@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.result.identifiability import NORMAL_95, Information, standard_deviations
 from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.laws import Law
+from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.memory import load_of
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -44,6 +45,7 @@ class TorqueFit:
             coefficients, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
+        offset: of the drives, to be added to the measured torque, (joint,) [N m; N].
         weight: of each sample under a robust loss, (sample, joint).
         outliers: samples to which it gives less than half weight.
     """
@@ -53,8 +55,25 @@ class TorqueFit:
     torque: Tensor
     starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
     information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    offset: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     weight: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
     outliers: tuple[Outliers, ...] = ()
+
+    def where(self, chosen: Tensor, other: "TorqueFit") -> "TorqueFit":
+        """The same with the chosen joints from another regression, (joint,)."""
+
+        def joined(own: Tensor, others: Tensor, trailing: int = 0) -> Tensor:
+            return torch.where(chosen[(..., *[None] * trailing)], others, own)
+
+        return TorqueFit(
+            joined(self.coefficients, other.coefficients, 1),
+            joined(self.residual, other.residual),
+            self.torque,
+            joined(self.starts, other.starts, 1),
+            joined(self.information, other.information, 2),
+            joined(torch.zeros_like(other.offset), other.offset),
+            joined(self.weight, other.weight),
+        )
 
 
 def friction_torque(
@@ -185,8 +204,8 @@ def fit_equation_error(
 
     Linear least squares within bounds for the linear coefficients, at every combination of the
     law's initial values of the others, which are then refined. Coefficients that are not fitted
-    keep their values in `known`, (joint, coefficient), by default the initial ones. Samples are
-    left out if their direction of motion is uncertain, or if the joint has moved by less than
+    keep their values in `known`, (joint, coefficient), by default the initial ones. A drive has a
+    constant offset where it is significant, unless the plant is not fitted. Samples are left out if their direction of motion is uncertain, or if the joint has moved by less than
     `beyond` times its range since the last reversal. A robust loss weights the squares. Recordings
     and motions are in joint coordinates.
 
@@ -213,9 +232,44 @@ def fit_equation_error(
         for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
     ]
     found = regress(law, parts, v_smooth, options, known)
+    measured = [np.zeros((1, plant.joints)) if r.tau is None else r.tau for r in recordings]
+    driven = torch.as_tensor(np.concatenate(measured).any(0))
+    if driven.any() and options.fit_plant and "f_o" not in law.names:
+        other, significant = _offset_regression(law, parts, v_smooth, options, known)
+        found = found.where(driven & significant, other)
     weights = zip(recordings, found.weight.split([len(r) for r in recordings]), strict=True)
     named = (outlier for r, weight in weights for outlier in named_outliers(r, weight.numpy()))
     return replace(found, outliers=tuple(named))
+
+
+def _offset_regression(
+    law: Law,
+    parts: Sequence[TorqueBalance],
+    v_smooth: float,
+    options: FitOptions,
+    known: Tensor | None,
+) -> tuple[TorqueFit, Tensor]:
+    """A regression with a constant torque of each drive, and where it is significant, (joint,).
+
+    A weight or a sensor's bias that the plant lacks would otherwise take the place of friction.
+    """
+
+    def torque(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+        return law.torque(qd, load, coefficients[..., :-1], v_smooth) - coefficients[..., -1]
+
+    constant = Coefficient("offset", "N m", positive=False)
+    wider = Law(law.name, (*law.coefficients, constant), torque)
+    found = regress(wider, parts, v_smooth, options, None if known is None else pad(known, [0, 1]))
+    values, known_of = found.coefficients[:, -1], found.information
+    sd = [standard_deviations(Information(x, 0.0 * x[0]))[-1] for x in known_of]
+    # Information about the coefficients with the offset unknown.
+    across = known_of[:, :-1, -1:]
+    alone = known_of[:, :-1, :-1] - across @ across.mT / known_of[:, -1:, -1:]
+    found = replace(
+        found, coefficients=found.coefficients[:, :-1], starts=found.starts[..., :-1],
+        information=alone, offset=values,
+    )  # fmt: skip
+    return found, values.abs() > NORMAL_95 * torch.stack(sd)
 
 
 def steady_law(law: Law) -> Law:
@@ -266,6 +320,7 @@ def regress(
         torch.stack([
             slopes[:, j].T @ slopes[:, j] / max(sd**2, 1e-300) for j, sd in enumerate(noise)
         ]),
+        offset=torch.zeros(len(many), dtype=torch.float64),
         weight=torch.where(kept, regression.root.square(), 1.0),
     )  # fmt: skip
 

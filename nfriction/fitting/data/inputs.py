@@ -116,8 +116,11 @@ def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Ar
         needed = plant.inverse_dynamics(*map(torch.as_tensor, (m.q, m.qd, m.qdd)))
         taken.append((0.0 if r.tau is None else r.tau) - needed.numpy())
     columns = zip(qd.T, np.concatenate(taken).T, strict=True)
-    # At rest the direction is that of the noise, and the power is none.
-    found = [np.linalg.lstsq(np.stack([v, v * abs(v)], 1), f * abs(v))[0][0] for v, f in columns]
+    # Beside viscous friction and a constant torque, such as a weight or a sensor's bias. At rest
+    # the direction is that of the noise, and the power is none.
+    found = [
+        np.linalg.lstsq(np.stack([v, v * abs(v), abs(v)], 1), f * abs(v))[0][0] for v, f in columns
+    ]
     return np.clip(found, 0.0, None)
 
 

@@ -196,6 +196,10 @@ class FitResult:
         # Including names of the constant law, which may be kept instead of a network or classes.
         law = {f"{name} of {joint}" for name in schedule.coefficient_names for joint in joints}
         names = law.union(schedule.parameter_names(joints))
+        pairs = zip(schedule.coefficient_names, schedule.fitted_mask, strict=True)
+        fitted = {f"{name} of {joint}" for name, free in pairs if free for joint in joints}
+        if self.unidentifiable and fitted <= {*self.unidentifiable}:
+            return "do not use", "the data determine no coefficient of the friction"
         if count := sum(not names.isdisjoint(x.split(" with ")) for x in self.unidentifiable):
             reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")

@@ -87,9 +87,13 @@ def information(
 def covariance_root(known: Information) -> Tensor:
     """R of the posterior covariance R R^T, (p, p); rows are infinite without information.
 
+    Information that is not finite, because simulations diverge, is none.
+
     With a score it is the sandwich covariance H^-1 (score + prior) H^-1 (H. White, Econometrica 50
     (1982), 1-25).
     """
+    if not all(x.isfinite().all() for x in (known.data, known.score) if x is not None):
+        return torch.full_like(known.data, torch.inf)
     scale, values, vectors = scaled_spectrum(known.data + torch.diag(known.prior))
     floor = torch.finfo(values.dtype).eps * len(values)
     root = scale[:, None] * vectors * values.clamp(min=floor).rsqrt()

@@ -67,9 +67,15 @@ def result_from_equation_error(
     found = identifiability.warnings_of(
         converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
     )
+    rig = start.plant if start else plant
+    largest = _largest_friction(model, rig, motions)
+    offsets = tuple(
+        _one_way(rig, joint, True, float(rig.torque_offset[joint] + change), largest)
+        for joint, change in enumerate(torque.offset.tolist()) if change
+    )  # fmt: skip
     return FitResult(
         model=model.requires_grad_(False),
-        plant=start.plant if start else plant,
+        plant=rig.replace(torque_offset=rig.torque_offset + torque.offset) if offsets else rig,
         plant_terms=start.plant_terms if start else (),
         status="Converged: linear least squares of the torque.",
         converged=True,
@@ -82,7 +88,7 @@ def result_from_equation_error(
             fitted_names, values, sd, lower, upper, model.law
         ),
         unidentifiable=unidentifiable,
-        warnings=(*found, BLURRED, *outlier_warning(torque.outliers)),
+        warnings=(*found, BLURRED, *offsets, *outlier_warning(torque.outliers)),
         outliers=torque.outliers,
     )
 
@@ -129,6 +135,7 @@ def result_from_shooting(
     vague = {i.name for i in intervals if i.low <= ends[i.name][0] and i.high >= ends[i.name][1]}
     favoured = [name for name in at_bounds if name not in vague]
     scaled = scale_warning(problem, intervals)
+    rig, far = rig_warning(problem, intervals)
     mistakes = lossless_motion(problem, at_zero) if residual > limit * noise else ()
     return FitResult(
         model=model.requires_grad_(False),
@@ -146,7 +153,7 @@ def result_from_shooting(
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
         mistakes=mistakes,
-        unmodelled=scaled,
+        unmodelled=scaled + rig * far,
         warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)
         + identifiability.warnings_of(
             converged=result.converged, at_bounds=favoured, unidentifiable=unidentifiable,
@@ -155,7 +162,7 @@ def result_from_shooting(
         + identifiability.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
-        + (scaled or (PROPORTIONAL,) * (not problem.windows.tau.any()))
+        + (scaled or rig or (PROPORTIONAL,) * (not problem.windows.tau.any()))
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
@@ -211,6 +218,40 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
     )
 
 
+def rig_warning(
+    problem: ShootingProblem, intervals: Sequence[Interval]
+) -> tuple[tuple[str, ...], bool]:
+    """A sentence if the fit changes the rig by more than its data usually err, and friction with it.
+
+    That is by more than the prior's standard deviation; the flag says if the change is beyond the
+    95 % of the prior. With recorded torques only a single term scales with them.
+    """
+    plant, driven = problem.jacobian.plant, bool(problem.windows.tau.any())
+    terms = {t.name: t for t in problem.variables.terms if t.ratio}
+    sure = [i for i in intervals if i.name in terms and i.low * i.high > 0]
+    if driven:
+        weights = [i for i in sure if i.name.startswith(("inertia", "mass"))]
+        every = [*_relative_weights(plant, intervals)] or weights
+        sure = weights if len(every) == 1 else []
+    sizes = [abs(i.value) / terms[i.name].prior_sd for i in sure]
+    if not sizes or max(sizes) <= 1:
+        return (), False
+    worst, far = sure[int(np.argmax(sizes))], max(sizes) > identifiability.NORMAL_95
+    name, scale = worst.name, 1 + worst.value
+    changed = f"{name[0].upper()}{name[1:]} is {scale:.3g} times that of the rig. "
+    if driven:
+        cause = (
+            f"Either the rig is wrong, or torques are recorded {scale:.3g} times as large as they "
+            "are (torque constant, gear ratio, unit); then so is the friction."
+        )
+    else:
+        cause = (
+            "So its masses, inertias, lengths or centres of mass do not agree. Without a recorded "
+            "torque friction is in proportion to them, and may be wrong by as much."
+        )
+    return (changed + cause,), far
+
+
 def rotor_warning(
     problem: ShootingProblem, at_bounds: Sequence[str], at_most: Sequence[str]
 ) -> tuple[str, ...]:
@@ -247,17 +288,23 @@ def offset_warnings(
         if abs(one.value) > terms[one.name].prior_sd * (usual if slides or not constant else 1):
             # An asymmetry is on the side of the friction.
             whole = float(dict(plant.named_buffers())[buffer][j]) * (1 if constant else -1)
-            kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")
-            unit = ("N" if slides else "N m") if constant else "N s/m times the speed"
-            way = "backwards" if whole > 0 else "forwards"
-            cause = f"may equally be friction that is {2 * abs(whole):.3g} {unit} larger {way}"
-            if constant and abs(whole) > largest[j]:
-                cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
-            yield (
-                f"The fitted plant has a {kind} of {whole:.3g} {unit} at {plant.joint_names[j]}, "
-                f"which {cause}. The friction model and its exports lack it: add {-whole:.3g} "
-                f"{unit} to a command."
-            )
+            yield _one_way(plant, j, constant, whole, largest)
+
+
+def _one_way(plant: Plant, joint: int, constant: bool, value: float, largest: Tensor) -> str:
+    """A sentence for a drive's torque in one direction, given the largest friction, (joint,)."""
+    slides = plant.unit == "m"
+    kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")
+    unit = ("N" if slides else "N m") if constant else "N s/m times the speed"
+    way = "backwards" if value > 0 else "forwards"
+    cause = f"may equally be friction that is {2 * abs(value):.3g} {unit} larger {way}"
+    if constant and abs(value) > largest[joint]:
+        cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
+    return (
+        f"The fitted plant has a {kind} of {value:.3g} {unit} at {plant.joint_names[joint]}, which "
+        f"{cause}. The friction model and its exports lack it: add {-value:.3g} {unit} to a "
+        "command."
+    )
 
 
 def _largest_friction(model: FrictionModel, plant: Plant, motions: Sequence[Motion]) -> Tensor:

@@ -74,7 +74,7 @@ def fit_constant(task: FitTask) -> FitResult:
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
-    plant = known_terms(start, fitter.jacobian.terms, task.delay)
+    plant = _begin(task, fitter, torque)
     friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     other_starts = None if linear else equation_error
@@ -84,7 +84,7 @@ def fit_constant(task: FitTask) -> FitResult:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
         nested = _fitter(task, contained, by_torque, eccentric)
-        begin = known_terms(start, nested.jacobian.terms, task.delay)
+        begin = _begin(task, nested, by_torque)
         search = warm_start_from_nested(
             search, fitter, nested, (by_torque.coefficients.reshape(-1), begin), task.motions,
             equation_error,
@@ -118,6 +118,17 @@ def fit_constant(task: FitTask) -> FitResult:
         late, biased = delay_warning(found, delayed, fitted.intervals)
         fitted = fitted.with_warnings(late, unmodelled=late if biased else ())
     return fitted.with_warnings(said)
+
+
+def _begin(task: FitTask, fitter: ShootingFitter, torque: TorqueFit) -> Tensor:
+    """Plant terms at the start: those of an earlier fit, and offsets that the torques imply."""
+    terms = fitter.jacobian.terms
+    begin = known_terms(task.start, terms, task.delay)
+    for k, term in enumerate(terms):
+        if "torque_offset" in term.change:
+            value = begin[k] + torque.offset[int(term.change["torque_offset"].argmax())]
+            begin[k] = value.clamp(term.lower, term.upper)
+    return begin
 
 
 def _fitter(
