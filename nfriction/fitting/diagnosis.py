@@ -62,8 +62,8 @@ class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
 
     `sd` is that of the smoothed accelerations [rad/s²] and `sd_of_mean` that of their block means,
-    zero if they are unknown. `turns` is 1 where a joint's velocity exceeds its noise, else 0. `time`
-    counts from the start of a recording [s], (sample, 1), and `number` the recordings.
+    zero if they are unknown. `turns` is 1 where a joint's velocity exceeds its noise, else 0.
+    `time` counts from the start of a recording [s], (sample, 1), and `number` the recordings.
     """
 
     q: Tensor
@@ -108,6 +108,7 @@ def likely_mistakes(
     options: FitOptions = DEFAULTS,
     *,
     zeroed: bool = False,
+    presliding: bool = False,
 ) -> tuple[float, tuple[Mistake, ...]]:
     """Share of unexplained torque as recorded, and mistakes whose correction reduces it greatly.
 
@@ -120,6 +121,7 @@ def likely_mistakes(
         motions: of the recordings, smoothed.
         convention: of the recorded angles.
         zeroed: encoders were set to zero at the start of each recording, in any pose.
+        presliding: the law has the stiffness of a contact, so that no spring is missing.
     """
     given = _collect(recordings, motions, options)
     # These spoil the balance, and a fit absorbs some wrong times in the inertia.
@@ -159,7 +161,8 @@ def likely_mistakes(
         unlike = [] if zeroed else unlike
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
-    rare = [*_springs(plant, given), *_geared(plant, convention, given)]
+    springs = () if presliding else _springs(plant, given)
+    rare = [*springs, *_geared(plant, convention, given)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
@@ -881,7 +884,8 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (
             f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit} that the rig lacks "
-            f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]})"
+            f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]}), or "
+            "hardly slides (fit a law with memory, such as `dahl`)"
         )
         yield text, _unexplained(plant, given, part)
 

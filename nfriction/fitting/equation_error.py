@@ -205,9 +205,10 @@ def fit_equation_error(
     Linear least squares within bounds for the linear coefficients, at every combination of the
     law's initial values of the others, which are then refined. Coefficients that are not fitted
     keep their values in `known`, (joint, coefficient), by default the initial ones. A drive has a
-    constant offset where it is significant, unless the plant is not fitted. Samples are left out if their direction of motion is uncertain, or if the joint has moved by less than
-    `beyond` times its range since the last reversal. A robust loss weights the squares. Recordings
-    and motions are in joint coordinates.
+    constant offset where it is significant, unless the plant is not fitted. Samples are left out if
+    their direction of motion is uncertain, or if the joint has moved by less than `beyond` times
+    its range since the last reversal. A robust loss weights the squares. Recordings and motions are
+    in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the

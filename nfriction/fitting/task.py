@@ -65,6 +65,7 @@ def prepare_task(
     if plant.has_position_load and not has_input(model.law, "position"):
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
+    inputs.require_parts(given, min(options.windows))
     given = given if motions else inputs.released(given)
     joint = inputs.in_joint_coordinates(plant, given, model.joints)
     moved = inputs.smoothed_motions(joint, motions)
@@ -95,8 +96,9 @@ def prepare_task(
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
     stated, mistakes = diagnosis.likely_mistakes(
-        plant, advanced, moved, convention, options, zeroed=per_recording
-    )
+        plant, advanced, moved, convention, options, zeroed=per_recording,
+        presliding=bool(model.law.memory),
+    )  # fmt: skip
     named = diagnosis.mistake_warning(stated, mistakes)
     for sentence in named:
         # A fit to such data may take minutes, and would report this only at its end.

@@ -979,3 +979,102 @@ def test_velocities_that_are_not_the_derivative_of_positions_are_named(factor):
     assert len(found) == (0 if factor == 1.0 else 2)
     for text in found:
         assert float(re.findall(r"is (\S+) times", text)[0]) == pytest.approx(factor, rel=0.1)
+
+
+def pushed(q: float, friction: float, weight: float, seed: int) -> Recording:
+    """A driven link of 0.08 kg m^2 that dry friction stops exactly, at times for seconds."""
+    time, random, h = np.arange(4001) / 500, np.random.default_rng(seed), 1 / 5000
+    waves = list(zip((0.8, 0.5, 0.3), (0.3, 0.7, 1.3), random.uniform(0, 6.28, 3), strict=True))
+    torque = sum(a * np.sin(2 * np.pi * f * time + phase) for a, f, phase in waves)
+    v, angle = 0.0, []
+    for given in torque:
+        angle.append(q)
+        for _ in range(10):
+            free = v + h / 0.08 * (given - weight * math.sin(q))
+            v = float(np.copysign(max(0.0, abs(free) - h / 0.08 * friction), free))
+            q += h * v
+    q_read = quantise(np.array(angle)[:, None], 65536)
+    torque = torque + 0.003 * random.standard_normal(len(torque))
+    return Recording(time, q_read, tau=torque[:, None], convention="relative,hanging")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_joint_that_friction_holds_has_no_drive_that_is_off(seed):
+    """Noise of a velocity near zero has a direction, too, for tenths of a second."""
+    rig = PendulumChain([0.5], [0.3], com=[0.204], inertia=[0.0592])
+    recording = pushed(0.0, 0.6, 0.5 * 9.81 * 0.204, seed)
+    assert prepare_task("CVFM", rig, recording, FitOptions()).mistakes == ()
+
+
+def test_presliding_is_not_named_a_spring():
+    plant, q, tau = measured("wheel")
+    recording = Recording(STEP * np.arange(len(q)), q, tau + 1.5 * q)
+    (spring,) = prepare_task("CVFM", plant, recording, FitOptions()).mistakes[:1]
+    assert "or hardly slides (fit a law with memory, such as `dahl`)" in spring
+    of_contact = prepare_task("dahl", plant, recording, FitOptions()).mistakes
+    assert not any("spring" in text for text in of_contact)
+
+
+@pytest.mark.parametrize(("inertia", "verdict"), [(0.95, None), (0.85, "good"), (0.79, "doubtful")])
+def test_a_free_rig_that_disagrees_with_its_motion_is_named(inertia, verdict):
+    model = CVFM(1, [[8e-3, 2e-3]], v_smooth=0.01)
+    plant = PendulumChain([0.5], [0.4], inertia=[0.0])
+    recording = swing(plant, model, seconds=4.0, start=(2.2,))
+    wrong = plant.replace(inertia_coupling=inertia * plant.inertia_coupling)
+    found = fit(CVFM(1), wrong, recording, windows=(1.0,), drag=False)
+    named = [w for w in found.warnings if "times that of the rig" in w]
+    assert len(named) == (verdict is not None)
+    for text in named:
+        assert text.startswith(f"Inertia 11 is {1 / inertia:.3g} times that of the rig. So its")
+        assert found.usability[0] == verdict
+
+
+@pytest.mark.parametrize(("scale", "verdict"), [(0.95, None), (0.85, "good"), (0.72, "doubtful")])
+@pytest.mark.parametrize("name", ["wheel", "axis"])
+def test_a_torque_that_scales_a_single_inertia_is_named(name, scale, verdict):
+    plant, q, tau = measured(name)
+    recording = Recording(STEP * np.arange(len(q)), q, scale * tau, unit=plant.unit)
+    found = fit(CVFM(1), plant, recording, windows=(1.0,))
+    named = [w for w in found.warnings if "times that of the rig" in w]
+    assert len(named) == (verdict is not None)
+    for text in named:
+        assert f"torques are recorded {scale:.2g}" in text
+        assert found.usability[0] == verdict
+
+
+def test_a_fit_that_determines_no_friction_is_not_to_be_used():
+    plant, q, tau = measured("wheel")
+    recording = Recording(STEP * np.arange(len(q)), q, tau)
+    found = fit(CVFM(1), plant, recording, method="equation_error")
+    assert found.usability[0] == "good"
+    partly = replace(found, unidentifiable=("F_c of joint1",))
+    assert partly.usability == ("doubtful", "the data do not determine 1 parameter")
+    nothing = replace(found, unidentifiable=("F_c of joint1", "F_v of joint1"))
+    assert nothing.usability == ("do not use", "the data determine no coefficient of the friction")
+
+
+@pytest.mark.parametrize("method", ["equation_error", "output_error"])
+@pytest.mark.parametrize("weight", [5.0, -5.0])
+def test_a_weight_that_the_rig_lacks_takes_no_friction(method, weight):
+    plant, q, tau = measured("axis")
+    recording = Recording(STEP * np.arange(len(q)), q, tau + weight, unit="m")
+    found = fit("CVFM", plant, recording, method=method, windows=(0.5, 2.0))
+    assert found.usability == ("good", "")
+    level = fit("CVFM", plant, Recording(recording.time, q, tau, unit="m"), method=method,
+                windows=(0.5, 2.0))  # fmt: skip
+    assert found.model.v_smooth == pytest.approx(level.model.v_smooth, rel=1e-6)
+    torch.testing.assert_close(
+        found.model.schedule.values, level.model.schedule.values, rtol=2e-3, atol=0
+    )
+    assert float(found.plant.torque_offset) == pytest.approx(-weight, rel=5e-3)
+    (told,) = (w for w in found.warnings if "constant drive force" in w)
+    assert "unless it is a sensor's bias, add" in told
+
+
+def test_rows_stamped_in_batches_are_refused():
+    """As by a host that reads a bus at 50 Hz."""
+    plant, q, tau = measured("wheel")
+    row = np.arange(len(q))
+    recording = Recording(0.02 * (row // 10) + 1e-5 * (row % 10), q, tau, name="usb")
+    with pytest.raises(ValueError, match=r"`time` of usb has 300 gaps.*give them even times"):
+        fit(CVFM(1), plant, recording)

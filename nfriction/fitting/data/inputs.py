@@ -149,6 +149,21 @@ def _refuse_repeated(recordings: Sequence[Recording]) -> None:
             )
 
 
+def require_parts(recordings: Sequence[Recording], shortest: float) -> None:
+    """Refuse a recording with many gaps between which no part is as long as a window [s]."""
+    for k, recording in enumerate(recordings):
+        parts, count = recording.segments, len(gaps(recording.time))
+        longest = max((recording.time[b] - recording.time[a] for a, b in parts), default=0.0)
+        # A few short parts may remain where blocks are left out.
+        if count >= MINIMUM_SAMPLES and longest < shortest:
+            raise ValueError(
+                f"`time` of {recording.name or f'recording {k + 1}'} has {count} gaps, and its "
+                f"longest part without one is {longest:.3g} s, shorter than the shortest window of "
+                f"{shortest:g} s. If a logger stamps its rows in batches, give them even times, as "
+                "`numpy.linspace(t[0], t[-1], len(t))`."
+            )
+
+
 def warn_of_undriven(recordings: Sequence[Recording]) -> None:
     """Warn of recordings without torque if others have it."""
     free = [r.name or f"recording {k + 1}" for k, r in enumerate(recordings) if r.tau is None]

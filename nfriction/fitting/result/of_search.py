@@ -221,7 +221,7 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
 def rig_warning(
     problem: ShootingProblem, intervals: Sequence[Interval]
 ) -> tuple[tuple[str, ...], bool]:
-    """A sentence if the fit changes the rig by more than its data usually err, and friction with it.
+    """A sentence if the fit changes the rig by more than its data usually err, and friction too.
 
     That is by more than the prior's standard deviation; the flag says if the change is beyond the
     95 % of the prior. With recorded torques only a single term scales with them.
@@ -300,9 +300,10 @@ def _one_way(plant: Plant, joint: int, constant: bool, value: float, largest: Te
     cause = f"may equally be friction that is {2 * abs(value):.3g} {unit} larger {way}"
     if constant and abs(value) > largest[joint]:
         cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
+    unless = "unless it is a sensor's bias, add" if constant else "add"
     return (
         f"The fitted plant has a {kind} of {value:.3g} {unit} at {plant.joint_names[joint]}, which "
-        f"{cause}. The friction model and its exports lack it: add {-value:.3g} {unit} to a "
+        f"{cause}. The friction model and its exports lack it: {unless} {-value:.3g} {unit} to a "
         "command."
     )
 
