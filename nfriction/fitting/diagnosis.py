@@ -419,17 +419,18 @@ def _collect(
         torque = recording.torque_at(stamps[at] + delay + drift * since)
         of = since[:, None], np.full((len(at), 1), k)
         noise = noise_of_mean = 0 * torque
-        turns = np.ones_like(torque)
+        turning = np.ones_like(torque)
         if motion.std is not None:
             noise = motion.std.qdd[at]
             # A mean acceleration is a difference of velocities, too.
             over = max(1, block - 1) * recording.sample_time
             noise_of_mean = np.minimum(noise, math.sqrt(2) / over * motion.std.qd[at])
-            turns[np.abs(motion.qd[at]) <= NORMAL_95 * motion.std.qd[at]] = 0.0
+            turning[np.abs(motion.qd[at]) <= NORMAL_95 * motion.std.qd[at]] = 0.0
         moved = motion.q[at], motion.qd[at], motion.qdd[at]
-        parts.append((*moved, noise, noise_of_mean, turns, torque, *of))
+        parts.append((*moved, noise, noise_of_mean, turning, torque, *of))
     found = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    return _Data(*found, block)
+    q, qd, qdd, sd, sd_of_mean, turns, tau, time, number = found
+    return _Data(q, qd, qdd, sd, sd_of_mean, turns, tau, time, number, block)
 
 
 def _corrected_positions(

@@ -1078,3 +1078,24 @@ def test_rows_stamped_in_batches_are_refused():
     recording = Recording(0.02 * (row // 10) + 1e-5 * (row % 10), q, tau, name="usb")
     with pytest.raises(ValueError, match=r"`time` of usb has 300 gaps.*give them even times"):
         fit(CVFM(1), plant, recording)
+
+
+def test_a_torque_sensor_that_is_clipped_or_stuck_is_named():
+    plant, q, tau = measured("wheel")
+
+    def named(torque: np.ndarray) -> list[str]:
+        return [w for w in warnings_of(plant, q, torque) if "clipped or stuck" in w]
+
+    noisy = tau + 0.01 * np.random.default_rng(0).standard_normal(tau.shape)
+    (clipped,) = named(np.clip(noisy, -1.5, 2.0))
+    assert re.search(r"does not change in \d+ % of the samples, at -1.5 and 2:", clipped)
+    stuck = noisy.copy()
+    stuck[1000:1400] = stuck[1000]
+    (held,) = named(stuck)
+    assert "13 % of the samples, from 2 s:" in held
+    # A coarse sensor, a slower bus, a drive that is off, and a limited command are sound.
+    off = noisy.copy()
+    off[1000:1400] = 0.0
+    for sound in (noisy, 0.05 * np.round(noisy / 0.05), np.repeat(noisy[::5], 5, 0)[: len(q)], off,
+                  np.clip(tau, -1.5, 2.0)):  # fmt: skip
+        assert not named(sound)

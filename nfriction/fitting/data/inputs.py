@@ -44,6 +44,10 @@ Array = NDArray[np.float64]
 TURN_SHARE = 1e-3
 # Jumps whose sizes differ by less than this fraction count as equal.
 ALIKE = 0.02
+# Expected number of chance events above which an event proves nothing.
+UNLIKELY = 0.01
+# Share of samples whose errors are lost among the others; buses are late for a few samples.
+FEW = 0.01
 # Shares of its range that a joint has moved just after its release, the second four times the
 # first.
 RELEASED = 0.01, 0.04
@@ -415,7 +419,7 @@ def data_warnings(
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
     of_logs = (
         *_unlike_clocks(given, options), *_spikes(given, options), *_torque_spikes(given, options),
-        *_velocities(joint, motions), *finer_counts(plant, given),
+        *_held_torques(given), *_velocities(joint, motions), *finer_counts(plant, given),
     )  # fmt: skip
     return (*of_logs, *still, *heavy)
 
@@ -577,6 +581,39 @@ def _torque_spikes(recordings: Sequence[Recording], options: FitOptions) -> Iter
                     f"at {_times(recording.time[1:-1][peak])}; if these are errors of the log, "
                     "interpolate them: a simulation adds them up, whatever the loss."
                 )
+
+
+def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
+    """Torques with noise that hold a value for longer than chance explains, except 0.
+
+    A drive that is off may be logged as 0. Without noise a torque is a command, which may be held.
+    """
+    for recording in recordings:
+        columns = (
+            () if recording.tau is None else zip(recording.names, recording.tau.T, strict=True)
+        )
+        for name, torque in columns:
+            edges = np.flatnonzero(np.diff(torque, prepend=np.nan, append=np.nan))
+            value, length = torque[edges[:-1]], np.diff(edges)
+            # Differences of a smooth signal shrink with their order, those of noise grow.
+            first, third = (np.abs(np.diff(value, n=n)) for n in (1, 3))
+            if len(third) < MINIMUM_SAMPLES or np.median(third) < np.median(first):
+                continue
+            usual = length[length < MINIMUM_SAMPLES]
+            same = (usual.sum() - len(usual)) / max(usual.sum(), 1)
+            chance = math.log(UNLIKELY / len(torque)) / math.log(same) if same else 0
+            held = (length > max(MINIMUM_SAMPLES, chance)) & (value != 0)
+            share = length[held].sum() / len(torque)
+            if share < FEW:
+                continue
+            ends = {*value[held].tolist()} & {float(torque.min()), float(torque.max())}
+            limits = " and ".join(f"{x:.3g}" for x in sorted(ends))
+            where = f" at {limits}" if ends else f" from {_times(recording.time[edges[:-1]][held])}"
+            yield (
+                f"{recording.name or 'A recording'}: the torque of {name} has noise, but does not "
+                f"change in {100 * share:.2g} % of the samples,{where}: its sensor is clipped or "
+                "stuck; leave these samples out."
+            )
 
 
 def _velocities(joint: Sequence[Recording], motions: Sequence[Motion]) -> Iterator[str]:
