@@ -139,7 +139,11 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
 @pytest.mark.parametrize(
     ("motion", "verdict"),
     # The last one needs more steps of the integration at the start of the search than at its end.
-    [((3, 0.1, 0.003), "doubtful"), ((1, 0.1, 0.003), "good"), ((0, 0.45, 0.05), "doubtful")],
+    [
+        ((3, 0.1, 0.003), "doubtful"),
+        ((1, 0.1, 0.003), "good"),
+        pytest.param((0, 0.45, 0.05), "doubtful", marks=pytest.mark.slow),
+    ],
 )
 def test_a_delay_makes_a_fit_doubtful_where_coefficients_leave_their_intervals(motion, verdict):
     recording, truth = driven_pendulum(*motion), np.ravel(DRY)

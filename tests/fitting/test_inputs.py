@@ -97,6 +97,7 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         assert off.abs().max() < 0.1
 
 
+@pytest.mark.slow
 def test_dry_and_viscous_friction_differ_by_direction_in_their_own_ratios() -> None:
     """The constant torque of a drive explains only the dry part."""
     time, step, inertia = 2e-3 * np.arange(2001), 2e-4, 0.08
@@ -145,7 +146,7 @@ def test_the_fall_by_heat_is_recovered() -> None:
     assert found.residual < 0.1 * law.residual
 
 
-@pytest.mark.parametrize("inputs", [["heat"], []])
+@pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
 def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs, monkeypatch):
     falls = ["The friction of joint1 falls by 30 %."]
     monkeypatch.setattr("nfriction.fitting.diagnosis.changing_friction", lambda *_: falls)

@@ -61,6 +61,7 @@ def test_friction_falls_by_the_exponential_of_heat(make) -> None:
     torch.testing.assert_close(model.torque(qd, normal, held), fall * cold)
 
 
+@pytest.mark.slow
 def test_compiled_and_eager_rollouts_heat_alike_and_lose_less_than_cold_friction() -> None:
     start = torch.tensor([2.0, 0.5], dtype=F64)
     plant = pendulum(normal_load="bearing")

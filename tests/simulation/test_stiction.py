@@ -134,7 +134,7 @@ def test_what_it_cannot_do_is_refused():
         rollout(plant, None, zero, zero, steps=2, scheme="time_stepping")
 
 
-@pytest.mark.parametrize("compiles", [True, False])
+@pytest.mark.parametrize("compiles", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_it_warms_joints_as_the_smooth_scheme_does(compiles, monkeypatch):
     plant, start = pendulum(normal_load="bearing"), torch.tensor([2.0, 0.5], dtype=F64)
     given = {"sample_time": 2e-3, "steps": 1000 if compiles else 50, "gradients": False}
