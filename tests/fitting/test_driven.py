@@ -29,8 +29,13 @@ def geared() -> PendulumChain:
     )  # fmt: skip
 
 
-def driven(plant: PendulumChain, model: FrictionModel, seed: int, seconds: float = 3.0):
-    """Sums of sines in torque from rest, stamped as a host's clock does: late now and then."""
+def driven(
+    plant: PendulumChain, model: FrictionModel, seed: int, seconds: float = 3.0, late: int = 0
+) -> Recording:
+    """Sums of sines in torque from rest, stamped as a host's clock does: late now and then.
+
+    The torque acts `late` samples after it is logged.
+    """
     random = np.random.default_rng(seed)
     step = np.abs(2e-3 + 1e-4 * random.standard_normal(round(seconds / 2e-3)))
     step[random.integers(0, len(step), 5)] = 5e-3
@@ -38,8 +43,9 @@ def driven(plant: PendulumChain, model: FrictionModel, seed: int, seconds: float
     rate = random.uniform(3.0, 12.0, (3, 2))
     tau = 0.35 * np.sin(rate * time[:, None, None] + random.uniform(0, 6, (3, 2))).sum(1)
     rest = torch.tensor([np.pi, 0.0], dtype=F64)
+    acting = np.concatenate([np.zeros((late, 2)), tau])[: len(tau) - 1]
     out = rollout(
-        plant, model, rest, torch.zeros_like(rest), torch.as_tensor(tau[:-1]),
+        plant, model, rest, torch.zeros_like(rest), torch.as_tensor(acting),
         sample_time=torch.as_tensor(step), substeps=4, gradients=False,
     )  # fmt: skip
     q = quantise(out.q.numpy() - [np.pi, 0.0], 16384)
@@ -282,3 +288,13 @@ def test_the_rotor_of_a_wheels_motor_counts_as_one(motor):
     problem = SimpleNamespace(windows=SimpleNamespace(tau=torch.ones(1)), jacobian=jacobian)
     has_rotor = motor is not None and bool(motor.rotor_inertia)
     assert (rotor_warning(problem, (), ("inertia 11",)) == ()) == has_rotor
+
+
+def test_a_delay_is_found_where_encoders_were_zeroed_at_rest():
+    """At first nothing acts, although torques are logged."""
+    plant, law = geared(), CVFM(2, [[0.05, 0.010], [0.03, 0.005]], v_smooth=V_SMOOTH)
+    early = [driven(plant, law, seed, seconds=2.0, late=4) for seed in (0, 1)]
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, early, windows=(0.5,), fit_delay=True)
+    assert found.encoder_offsets
+    assert found.torque_delay == pytest.approx(-8e-3, rel=0.1)
+    assert found.residual < 1e-3

@@ -115,7 +115,9 @@ class ShootingFitter:
     ) -> Windows:
         """Windows of recordings, each from the state of its motion; see `cut_windows`."""
         # Encoders zeroed in a pose that stiction holds were zeroed at rest.
-        rest_speed = None if self.offset_sd is None else self.options.rest_speed
+        # The torque before the first sample is not known, and a delay moves it into the window.
+        at_rest = self.offset_sd is not None and self.jacobian.delay_index is None
+        rest_speed = self.options.rest_speed if at_rest else None
         return cut_windows(
             self.recordings, motions, length, smoothed=smoothed, rest_speed=rest_speed
         )
