@@ -50,6 +50,14 @@ MINIMUM_ROWS = 8
 FAST = 60.0
 # Share of the largest velocity up to which a joint is at rest.
 RESTING = 1e-3
+# Units of velocity by how many 1 rad/s is.
+UNITS = {30 / math.pi: "rpm", 180 / math.pi: "degrees per second"}
+# Other factors: velocities are in a unit only if its factor fits best.
+OTHERS = (1.0, 2.0, 4.0, 7.6, 12.0, 24.0, 46.0, 72.0, 150.0)
+# Rows and ends of rows that the search for such units uses at most.
+MIXED_ROWS, MIXED_ENDS = 1000, 24
+# Chance level: equal rows of which fewer have a neighbour are copies.
+CHANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +102,26 @@ class JointTorque:
         """Unordered rows without those at rest, where dry friction can have any value."""
         fast = np.abs(self.qd) > RESTING * np.abs(self.qd).max()
         return self if self.time is not None or fast.all() or not fast.any() else self.rows(fast)
+
+    @property
+    def distinct(self) -> JointTorque:
+        """Unordered rows without copies, which would feign a certainty that nobody measured.
+
+        Readings of a coarse sensor are equal by chance, but then some are one step of its torque
+        apart, and not all occur a multiple of k times: there only copies of the whole table go.
+        """
+        if self.time is not None:
+            return self
+        every = (self.q, self.qd, self.qdd, self.load, self.temperature, self.tau)
+        table = np.stack([x for x in every if x is not None], 1)
+        rows, where, counts = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+        gaps, step = np.diff(rows, axis=0), np.diff(np.unique(self.tau)).min(initial=math.inf)
+        near = (gaps[:, :-1] == 0.0).all(1) & (gaps[:, -1] < 1.5 * step)
+        coarse = near.sum() >= CHANCE * len(rows)
+        kept = counts // (np.gcd.reduce(counts) if coarse else counts)
+        order = np.argsort(where.ravel(), kind="stable")
+        repeat = np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self.rows(np.sort(order[repeat < np.repeat(kept, counts)]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,6 +219,16 @@ class TorqueTable:
         table = table.set_axis([str(name) for name in table.columns], axis=1)
         sources = _sources(table, columns or {})
         _require_unit(unit, sources)
+        remarks: list[str] = []
+        if torque and ("time", 0) in sources:
+            # Without time, equal rows need not be copies: `JointTorque.distinct` judges.
+            given = len(table)
+            table = table.drop_duplicates([column for column, _ in sources.values()])
+            if len(table) < given:
+                remarks.append(
+                    f"{given - len(table)} of {given} rows are copies of others, time included, "
+                    "and are left out."
+                )
         values = {
             key: _numbers(table, key[0], *source, degrees=degrees)
             for key, source in sources.items()
@@ -207,7 +245,6 @@ class TorqueTable:
             found["time"] = values.get(("time", 0))
             names.append(name)
             parts.append({key: None if x is None else x[rows] for key, x in found.items()})
-        remarks: list[str] = []
         joints = [_joint(*pair, remarks) for pair in zip(names, parts, strict=True)]
         for joint in joints:
             if unit == "rad" and joint.q is not None and joint.time is not None:
@@ -219,7 +256,9 @@ class TorqueTable:
                     )
         stated = any(named for (key, _), (_, named) in sources.items() if key in ("q", "qd"))
         if unit == "rad" and not (degrees or stated):
-            fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
+            mixed = {j.name: text for j in joints if torque and (text := _mixed(j))}
+            remarks += mixed.values()
+            fast = [j.name for j in joints if np.abs(j.qd).max() > FAST and j.name not in mixed]
             if fast:
                 remarks.append(
                     f"The velocity of {', '.join(fast)} exceeds {FAST:g} rad/s, as degrees per "
@@ -399,17 +438,66 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         )
     if np.ptp(tau) == 0.0:
         raise ValueError(f"the friction torque of {name} is {tau[0]:g} in every row.")
-    if float(tau @ qd) < 0.0:
-        remarks.append(
-            f"The friction torque of {name} drives the joint on average, as with the wrong sign: "
-            "it must be positive with positive velocity. If the sign is wrong, reverse it."
-        )
-    elif min(ways) > 0.0 and (tau.min() >= 0.0 or tau.max() <= 0.0):
+    if min(ways) > 0.0 and (tau.min() >= 0.0 or tau.max() <= 0.0):
         remarks.append(
             f"The friction torque of {name} has one sign in both directions, as without its sign "
             "or with a load: give it the sign of the velocity, or subtract the torque of the load."
         )
+    elif float(tau @ qd) < 0.0:
+        remarks.append(
+            f"The friction torque of {name} drives the joint on average, as with the wrong sign: "
+            "it must be positive with positive velocity. If the sign is wrong, reverse it."
+        )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
+
+
+def odd_terms(joint: JointTorque, qd: Array) -> Array:
+    """Torques that reverse with the velocity qd (row,), (row, term): a coarse law of any shape."""
+    speed = np.abs(qd)
+    load = [] if joint.load is None else [joint.load]
+    return np.sign(qd)[:, None] * np.stack([speed**0, speed, np.sqrt(speed), *load], 1)
+
+
+def _mixed(joint: JointTorque) -> str:
+    """Remark on rows of one direction, or from an end, with velocities in another unit."""
+    joint = joint.rows(np.arange(0, len(joint), math.ceil(len(joint) / MIXED_ROWS)))
+    rows = np.arange(len(joint))
+    parts = {"rows with negative velocity": joint.qd < 0}
+    parts["rows with positive velocity"] = joint.qd > 0
+    for share in np.linspace(0, 100, MIXED_ENDS + 1)[1:-1]:
+        first = rows < round(share / 100 * len(rows))
+        parts[f"first {share:.0f} % of the rows"] = first
+        parts[f"last {100 - share:.0f} % of the rows"] = ~first
+
+    def error(part: NDArray[np.bool_], factor: float) -> float:
+        """Sum of squares that a law of any shape and an offset do not explain."""
+        qd = np.where(part, joint.qd / factor, joint.qd)
+        terms = np.column_stack([odd_terms(joint, qd), np.ones_like(qd)])
+        found = np.linalg.lstsq(terms, joint.tau, None)[0]
+        return float(np.square(joint.tau - terms @ found).sum())
+
+    given = error(rows < 0, 1.0)
+    # Errors below 1 % of the torque do not matter.
+    if not given > 1e-4 * float(joint.tau @ joint.tau):
+        return ""
+    least, factor, where = min(
+        [
+            (error(part, factor), factor, name)
+            for name, part in parts.items()
+            if MINIMUM_ROWS <= part.sum() <= len(rows) - MINIMUM_ROWS
+            for factor in (*OTHERS, *UNITS)
+        ],
+        key=lambda found: found[0],
+        default=(given, 1.0, ""),
+    )
+    # The error has to fall by more than half.
+    if factor not in UNITS or least > given / 4:
+        return ""
+    return (
+        f"The {where} of {joint.name} agree with the others if their velocity is read in "
+        f"{UNITS[factor]}: the error falls by {100 - 100 * math.sqrt(least / given):.0f} %. "
+        "Convert them to rad/s."
+    )
 
 
 def _derivatives(time: Array, q: Array, qdd: Array | None) -> tuple[Array, Array]:

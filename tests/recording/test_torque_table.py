@@ -109,6 +109,9 @@ def test_doubts_are_remarked() -> None:
     assert "one direction only" in one_way.remarks[0]
     unsigned = TorqueTable.from_pandas(table(tau=np.abs(table().tau)))
     assert "has one sign in both directions" in unsigned.remarks[0]
+    # Noise may let such a torque drive the joint on average.
+    tau = np.where(QD > 0, 0.1, 0.2) + np.abs(QD)
+    assert "has one sign" in TorqueTable.from_pandas(table(tau=tau)).remarks[0]
     fast = TorqueTable.from_pandas(table(qd=np.rad2deg(2 * QD)))
     assert "degrees per second or revolutions per minute" in fast.remarks[0]
     assert not TorqueTable.from_pandas(table(qd=1e3 * QD), columns={"qd": "qd:rpm"}).remarks
@@ -119,3 +122,57 @@ def test_a_digest_follows_the_content() -> None:
     one, same = (TorqueTable.from_pandas(table()) for _ in range(2))
     assert one.digest() == same.digest()
     assert one.digest() != TorqueTable.from_pandas(table(tau=QD)).digest()
+
+
+def speeds(noise: float = 0.005, repeats: int = 1, seed: int = 0) -> pd.DataFrame:
+    """Stribeck friction at eight speeds in both directions."""
+    qd = np.repeat([0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.0], repeats)
+    qd = np.r_[qd, -qd]
+    tau = np.sign(qd) * (0.3 + 0.15 * np.exp(-((qd / 0.5) ** 2))) + 0.08 * qd
+    return pd.DataFrame(
+        {"qd": qd, "tau": tau + noise * np.random.default_rng(seed).normal(size=len(qd))}
+    )
+
+
+@pytest.mark.parametrize("factor", [30 / np.pi, 180 / np.pi])
+def test_velocities_in_two_units_are_remarked(factor: float) -> None:
+    unit = "rpm" if factor < 10 else "degrees per second"
+    one = speeds()
+    half = TorqueTable.from_pandas(one.assign(qd=one.qd.where(one.qd > 0, factor * one.qd)))
+    agree = f"of joint1 agree with the others if their velocity is read in {unit}"
+    assert f"The rows with negative velocity {agree}" in half.remarks[0]
+    two = pd.concat([one, speeds(seed=1).assign(qd=lambda x: factor * x.qd)])
+    (remark,) = TorqueTable.from_pandas(two).remarks
+    assert f"The last 50 % of the rows {agree}" in remark
+
+
+def test_no_other_difference_looks_like_another_unit() -> None:
+    for seed in range(40):
+        one = speeds(0.02, seed=seed)
+        sign = np.sign(one.qd)
+        fan = sign * (0.3 + 0.02 * one.qd**2)
+        for tau in (one.tau, one.tau + 0.1, (1 - 0.2 * sign) * one.tau, fan):
+            first = one.assign(tau=tau)
+            for table in (first, pd.concat([first, speeds(0.02, seed=99)])):
+                remarks = TorqueTable.from_pandas(table).remarks
+                assert not any("agree" in remark for remark in remarks)
+
+
+def test_copies_of_rows_are_not_distinct_but_coarse_readings_are() -> None:
+    def kept(table: pd.DataFrame) -> int:
+        return len(TorqueTable.from_pandas(table).joints[0].distinct)
+
+    fine, coarse = speeds(0.01, 10), speeds(0.01, 30)
+    coarse["tau"] = coarse.tau.round(2)
+    assert coarse.duplicated().sum() > 300
+    # The whole table several times, in any order; and one half twice.
+    for table in (fine, coarse):
+        assert kept(table) == len(table)
+        assert kept(pd.concat([table] * 3)) == len(table)
+        assert kept(pd.concat([table] * 3).sort_values("tau")) == len(table)
+    assert kept(pd.concat([fine, fine[:80]])) == 160
+    # With time there is no doubt.
+    timed = fine.assign(time=np.arange(160.0))
+    copied = TorqueTable.from_pandas(pd.concat([timed, timed[40:]]))
+    assert len(copied.joints[0]) == 160
+    assert copied.remarks[0].startswith("120 of 280 rows are copies of others, time included")
