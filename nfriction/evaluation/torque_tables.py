@@ -33,6 +33,7 @@ from nfriction.recording.torque_table import (
     TorqueTable,
     as_table,
     blocks,
+    odd_terms,
 )
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ WITH_BOTH = ("load-slip",)
 FENCE = 3.0
 # Errors below this part of the median torque do not matter.
 SMALL = 0.01
+# Rows far off are single mistakes up to this share, or number, which are listed.
+FEW, LISTED = 0.03, 3
 # A drive holds a speed within this part of it.
 SAME_SPEED = 0.02
 
@@ -309,14 +312,19 @@ def fit_torque(
     # One velocity for all joints, as a model file has one.
     v_smooth = torque_table.turning_velocity(given)
     remarks = list(given.remarks)
-    sliding = tuple(joint.sliding for joint in given.joints)
-    for all_rows, moving in zip(given.joints, sliding, strict=True):
-        if resting := len(all_rows) - len(moving):
+    for every in given.joints:
+        moving = every.sliding
+        if resting := len(every) - len(moving):
             remarks.append(
-                f"{moving.name} is at rest in {resting} of {len(all_rows)} rows, which are left "
+                f"{moving.name} is at rest in {resting} of {len(every)} rows, which are left "
                 "out: there dry friction can have any value."
             )
-    given = replace(given, joints=sliding)
+        if copies := len(moving) - len(moving.distinct):
+            remarks.append(
+                f"{copies} of {len(moving)} rows of {moving.name} are copies of others in all "
+                "columns, which would narrow the intervals, and are left out."
+            )
+    given = replace(given, joints=tuple(joint.sliding.distinct for joint in given.joints))
     fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
     failed: dict[str, str] = {}
@@ -347,18 +355,27 @@ def fit_torque(
 
 
 def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str]:
-    """Rows far off the chosen law, or an error that follows the velocity or load, a sentence each.
+    """Causes of the error of the chosen law, a sentence each.
 
-    Only for rows in no order: along a motion, errors follow reversals and what precedes them.
+    An offset, direction or inertia; for rows in no order, since along a motion errors follow
+    reversals and what precedes them, also the velocity or load, or rows far off the law.
     """
-    error = joint.tau - torque_table.predict(model, joint).numpy()
+    torque = torque_table.predict(model, joint).numpy()
     # At rest, dry friction can have any value.
-    rows = np.flatnonzero(np.abs(joint.qd) > 3 * model.v_smooth)
-    if joint.time is not None or len(rows) < MINIMUM_ROWS:
+    moving = np.abs(joint.qd) > 3 * model.v_smooth
+    joint, torque = joint.rows(moving), torque[moving]
+    error = joint.tau - torque
+    rows, small = np.argsort(joint.qd), SMALL * float(np.median(np.abs(joint.tau)))
+    if len(rows) < MINIMUM_ROWS:
         return
-    rows, small = rows[np.argsort(joint.qd[rows])], SMALL * float(np.median(np.abs(joint.tau)))
-    share = max(0.5, 3 / math.sqrt(len(rows)))
     own = f"{plain_name(type(model).__name__)} at {joint.name}"
+    remark, cause = _cause(joint, torque, small, own, unit)
+    error -= cause
+    if remark:
+        yield remark
+    if joint.time is not None:
+        return
+    share = max(0.5, 3 / math.sqrt(len(rows)))
     left = error[rows] - error[rows].mean()
     common, quantity = float(left[1:] @ left[:-1]), "velocity"
     if joint.load is not None:
@@ -380,13 +397,70 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
     low, high = np.quantile(left, (0.25, 0.75))
     reach = max(FENCE * (high - low), small)
     far = rows[(left < low - reach) | (left > high + reach)]
-    if len(far):
-        off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:3])
-        more = f" and {len(far) - 3} more" * (len(far) > 3)
+    if len(far) > max(LISTED, FEW * len(rows)):
+        yield (
+            f"{len(far)} of {len(rows)} torques are far off {own}, as with phases of acceleration "
+            "in the table; leave these out, or subtract inertia times acceleration."
+        )
+    elif len(far):
+        off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:LISTED])
+        more = f" and {len(far) - LISTED} more" * (len(far) > LISTED)
         yield (
             f"Torques far off {own}: {off}{more}. Check these rows; if they are mistakes, drop "
             "them and fit again."
         )
+
+
+def _cause(
+    joint: JointTorque, torque: Array, small: float, own: str, unit: str
+) -> tuple[str, Array]:
+    """A cause that explains more of the error of a law's torque (row,) than chance over blocks.
+
+    Returns:
+        A sentence, empty if there is none, and the cause's torque (row,) [N m; N].
+    """
+    odd, parts = odd_terms(joint, joint.qd), blocks(joint, min(FOLDS, len(joint)))
+    one, way = np.ones_like(torque), np.sign(joint.qd) * torque
+    given = np.stack([joint.tau - torque, one, way, joint.qdd], 1)
+    # Without the part that a law of the velocity may explain, whatever its shape.
+    error, *causes = (given - odd @ np.linalg.lstsq(odd, given, None)[0]).T
+    plain, *left = (_left_out(error, x, parts) for x in (np.zeros_like(error), *causes))
+    best = int(np.argmin([float(x.sum()) for x in left]))
+    sizes = [float(x @ error) / max(float(x @ x), 1e-300) for x in causes]
+    found, chance = sizes[best] * given[:, 1 + best], DEFAULTS.input_chance / len(causes)
+    if (
+        # Torques of one sign have another cause; a lag of friction resembles a negative inertia.
+        float(joint.tau.min() * joint.tau.max()) >= 0.0
+        or (best == 2 and sizes[2] < 0.0)
+        or float(np.square(found).mean()) <= small**2
+        or not gains(left[best], plain, chance)
+    ):
+        return "", np.zeros_like(error)
+    ways, share = ("negative", "positive")[:: 1 if sizes[1] > 0 else -1], abs(sizes[1])
+    texts = (
+        f"The torque is {abs(sizes[0]):.3g} {'N m' if unit == 'rad' else 'N'} "
+        f"{'above' if sizes[0] > 0 else 'below'} {own} in both directions, as with an offset of "
+        "the sensor or a constant load; subtract it and fit again, or add arctan, which has one.",
+        f"Friction is {200 * share / (1 + share):.0f} % less in {ways[0]} than in {ways[1]} "
+        f"direction, unlike {own}; fit each direction as a joint of its own.",
+        f"The error of {own} follows the acceleration, as with an inertia of {sizes[2]:.3g} "
+        f"{'kg m²' if unit == 'rad' else 'kg'}; leave out phases of acceleration, or subtract "
+        "inertia times acceleration.",
+    )
+    # In a narrow range of torques, an offset and a direction are alike.
+    alike = best < 2 and not gains(left[best], left[1 - best], chance)
+    return texts[best] + f" Or, explaining as much: {texts[1 - best]}" * alike, found
+
+
+def _left_out(error: Array, cause: Array, parts: Sequence[NDArray[np.intp]]) -> torch.Tensor:
+    """Mean square of the error (row,) of each block beside a cause sized by the rest, (block,)."""
+    square, product = cause**2, cause * error
+    sizes = [(product.sum() - product[k].sum()) / max(square.sum() - square[k].sum(), 1e-300)
+             for k in parts]  # fmt: skip
+    return torch.tensor([
+        float(np.square(error[k] - size * cause[k]).mean())
+        for k, size in zip(parts, sizes, strict=True)
+    ])  # fmt: skip
 
 
 def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Candidate]:

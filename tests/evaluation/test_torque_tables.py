@@ -249,6 +249,62 @@ def test_rows_at_rest_are_left_out() -> None:
     assert float(found.score(table).rmse.iloc[0]) < 0.003
 
 
+def speeds(rows: int = 10, noise: float = 0.01, seed: int = 0, ramp: float = 0.0) -> pd.DataFrame:
+    """Stribeck friction at eight speeds in both directions, every 0.01 s, after ramps [rad/s²]."""
+    speed = np.repeat([0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0], 2 * rows)
+    sign = np.tile(np.repeat([1, -1], rows), 8)
+    rising = abs(ramp) * np.tile(0.01 * np.arange(1, rows + 1), 16)
+    qd = sign * (np.minimum(rising, speed) if ramp else speed)
+    qdd = sign * ramp * (rising < speed)
+    tau = np.sign(qd) * (0.3 + 0.15 * np.exp(-((qd / 0.5) ** 2))) + 0.08 * qd + 0.05 * qdd
+    tau += noise * np.random.default_rng(seed).normal(size=len(qd))
+    time = 0.01 * np.arange(len(qd)) + np.repeat(np.arange(16.0), rows)
+    return pd.DataFrame({"time": time, "qd": qd, "tau": tau})
+
+
+LAWS = "viscous,coulomb-viscous,stribeck"
+
+
+def test_copies_of_rows_do_not_narrow_the_intervals() -> None:
+    once = speeds(1)[["qd", "tau"]]
+    five = fit_torque(pd.concat([once] * 5), "stribeck")
+    assert "64 of 80 rows of joint1 are copies of others" in five.table.remarks[0]
+    pd.testing.assert_frame_equal(five.intervals(), fit_torque(once, "stribeck").intervals())
+
+
+@pytest.mark.parametrize("rows", [1, 20])
+@pytest.mark.parametrize("timed", [True, False])
+def test_an_offset_and_friction_that_differs_by_direction_are_remarked(
+    rows: int, timed: bool
+) -> None:
+    table = speeds(rows)
+    table = table if timed else table.drop(columns="time")
+    (remark,) = fit_torque(table.assign(tau=table.tau + 0.1), LAWS).table.remarks
+    assert remark.startswith(("The torque is 0.09", "The torque is 0.1"))
+    assert "in both directions, as with an offset of the sensor" in remark
+    less = table.assign(tau=table.tau.where(table.qd > 0, 0.7 * table.tau))
+    (remark,) = fit_torque(less, LAWS).table.remarks
+    assert remark.startswith(("Friction is 30 %", "Friction is 29 %", "Friction is 31 %"))
+    assert "less in negative than in positive direction" in remark
+
+
+def test_sound_tables_have_no_cause_of_error() -> None:
+    for seed in range(40):
+        for table in (speeds(1, seed=seed).drop(columns="time"), speeds(10, seed=seed)):
+            remarks = fit_torque(table, "stribeck", folds=2).table.remarks
+            assert not any("offset" in r or "direction" in r or "accel" in r for r in remarks)
+
+
+def test_phases_of_acceleration_are_remarked() -> None:
+    (remark,) = fit_torque(speeds(300, ramp=5.0), LAWS).table.remarks
+    assert "at joint1 follows the acceleration, as with an inertia of 0.0" in remark
+    # Without time, they are at least no single mistakes.
+    both = pd.concat([speeds(200, ramp=20.0), speeds(200, seed=1, ramp=-20.0)])
+    (remark,) = fit_torque(both.drop(columns="time"), LAWS).table.remarks
+    assert remark.startswith("412 of 6400 torques are far off ")
+    assert "as with phases of acceleration" in remark
+
+
 def test_summary_and_notebook_show_choice_and_intervals() -> None:
     found = fit_torque(stribeck_table(), "coulomb-viscous,stribeck")
     for text in (repr(found), found.summary(), found._repr_html_()):
