@@ -33,7 +33,6 @@ from nfriction.recording.torque_table import (
     TorqueTable,
     as_table,
     blocks,
-    odd_terms,
 )
 
 if TYPE_CHECKING:
@@ -419,7 +418,7 @@ def _cause(
     Returns:
         A sentence, empty if there is none, and the cause's torque (row,) [N m; N].
     """
-    odd, parts = odd_terms(joint, joint.qd), blocks(joint, min(FOLDS, len(joint)))
+    odd, parts = _odd_terms(joint), blocks(joint, min(FOLDS, len(joint)))
     one, way = np.ones_like(torque), np.sign(joint.qd) * torque
     given = np.stack([joint.tau - torque, one, way, joint.qdd], 1)
     # Without the part that a law of the velocity may explain, whatever its shape.
@@ -450,6 +449,13 @@ def _cause(
     # In a narrow range of torques, an offset and a direction are alike.
     alike = best < 2 and not gains(left[best], left[1 - best], chance)
     return texts[best] + f" Or, explaining as much: {texts[1 - best]}" * alike, found
+
+
+def _odd_terms(joint: JointTorque) -> Array:
+    """Torques that reverse with the velocity, (row, term): a coarse law of any shape."""
+    speed = np.abs(joint.qd)
+    load = [] if joint.load is None else [joint.load]
+    return np.sign(joint.qd)[:, None] * np.stack([speed**0, speed, np.sqrt(speed), *load], 1)
 
 
 def _left_out(error: Array, cause: Array, parts: Sequence[NDArray[np.intp]]) -> torch.Tensor:

@@ -50,12 +50,6 @@ MINIMUM_ROWS = 8
 FAST = 60.0
 # Share of the largest velocity up to which a joint is at rest.
 RESTING = 1e-3
-# Units of velocity by how many 1 rad/s is.
-UNITS = {30 / math.pi: "rpm", 180 / math.pi: "degrees per second"}
-# Other factors: velocities are in a unit only if its factor fits best.
-OTHERS = (1.0, 2.0, 4.0, 7.6, 12.0, 24.0, 46.0, 72.0, 150.0)
-# Rows and ends of rows that the search for such units uses at most.
-MIXED_ROWS, MIXED_ENDS = 1000, 24
 # Chance level: equal rows of which fewer have a neighbour are copies.
 CHANCE = 0.05
 
@@ -256,9 +250,7 @@ class TorqueTable:
                     )
         stated = any(named for (key, _), (_, named) in sources.items() if key in ("q", "qd"))
         if unit == "rad" and not (degrees or stated):
-            mixed = {j.name: text for j in joints if torque and (text := _mixed(j))}
-            remarks += mixed.values()
-            fast = [j.name for j in joints if np.abs(j.qd).max() > FAST and j.name not in mixed]
+            fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
             if fast:
                 remarks.append(
                     f"The velocity of {', '.join(fast)} exceeds {FAST:g} rad/s, as degrees per "
@@ -449,55 +441,6 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
             "it must be positive with positive velocity. If the sign is wrong, reverse it."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
-
-
-def odd_terms(joint: JointTorque, qd: Array) -> Array:
-    """Torques that reverse with the velocity qd (row,), (row, term): a coarse law of any shape."""
-    speed = np.abs(qd)
-    load = [] if joint.load is None else [joint.load]
-    return np.sign(qd)[:, None] * np.stack([speed**0, speed, np.sqrt(speed), *load], 1)
-
-
-def _mixed(joint: JointTorque) -> str:
-    """Remark on rows of one direction, or from an end, with velocities in another unit."""
-    joint = joint.rows(np.arange(0, len(joint), math.ceil(len(joint) / MIXED_ROWS)))
-    rows = np.arange(len(joint))
-    parts = {"rows with negative velocity": joint.qd < 0}
-    parts["rows with positive velocity"] = joint.qd > 0
-    for share in np.linspace(0, 100, MIXED_ENDS + 1)[1:-1]:
-        first = rows < round(share / 100 * len(rows))
-        parts[f"first {share:.0f} % of the rows"] = first
-        parts[f"last {100 - share:.0f} % of the rows"] = ~first
-
-    def error(part: NDArray[np.bool_], factor: float) -> float:
-        """Sum of squares that a law of any shape and an offset do not explain."""
-        qd = np.where(part, joint.qd / factor, joint.qd)
-        terms = np.column_stack([odd_terms(joint, qd), np.ones_like(qd)])
-        found = np.linalg.lstsq(terms, joint.tau, None)[0]
-        return float(np.square(joint.tau - terms @ found).sum())
-
-    given = error(rows < 0, 1.0)
-    # Errors below 1 % of the torque do not matter.
-    if not given > 1e-4 * float(joint.tau @ joint.tau):
-        return ""
-    least, factor, where = min(
-        [
-            (error(part, factor), factor, name)
-            for name, part in parts.items()
-            if MINIMUM_ROWS <= part.sum() <= len(rows) - MINIMUM_ROWS
-            for factor in (*OTHERS, *UNITS)
-        ],
-        key=lambda found: found[0],
-        default=(given, 1.0, ""),
-    )
-    # The error has to fall by more than half.
-    if factor not in UNITS or least > given / 4:
-        return ""
-    return (
-        f"The {where} of {joint.name} agree with the others if their velocity is read in "
-        f"{UNITS[factor]}: the error falls by {100 - 100 * math.sqrt(least / given):.0f} %. "
-        "Convert them to rad/s."
-    )
 
 
 def _derivatives(time: Array, q: Array, qdd: Array | None) -> tuple[Array, Array]:

@@ -134,30 +134,6 @@ def speeds(noise: float = 0.005, repeats: int = 1, seed: int = 0) -> pd.DataFram
     )
 
 
-@pytest.mark.parametrize("factor", [30 / np.pi, 180 / np.pi])
-def test_velocities_in_two_units_are_remarked(factor: float) -> None:
-    unit = "rpm" if factor < 10 else "degrees per second"
-    one = speeds()
-    half = TorqueTable.from_pandas(one.assign(qd=one.qd.where(one.qd > 0, factor * one.qd)))
-    agree = f"of joint1 agree with the others if their velocity is read in {unit}"
-    assert f"The rows with negative velocity {agree}" in half.remarks[0]
-    two = pd.concat([one, speeds(seed=1).assign(qd=lambda x: factor * x.qd)])
-    (remark,) = TorqueTable.from_pandas(two).remarks
-    assert f"The last 50 % of the rows {agree}" in remark
-
-
-def test_no_other_difference_looks_like_another_unit() -> None:
-    for seed in range(40):
-        one = speeds(0.02, seed=seed)
-        sign = np.sign(one.qd)
-        fan = sign * (0.3 + 0.02 * one.qd**2)
-        for tau in (one.tau, one.tau + 0.1, (1 - 0.2 * sign) * one.tau, fan):
-            first = one.assign(tau=tau)
-            for table in (first, pd.concat([first, speeds(0.02, seed=99)])):
-                remarks = TorqueTable.from_pandas(table).remarks
-                assert not any("agree" in remark for remark in remarks)
-
-
 def test_copies_of_rows_are_not_distinct_but_coarse_readings_are() -> None:
     def kept(table: pd.DataFrame) -> int:
         return len(TorqueTable.from_pandas(table).joints[0].distinct)
