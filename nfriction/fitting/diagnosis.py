@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_buffers, adjusted_plant
+from nfriction.fitting.data.inputs import weighs
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.identifiability import NORMAL_95
@@ -162,7 +163,7 @@ def likely_mistakes(
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
     springs = () if presliding else _springs(plant, given)
-    rare = [*springs, *_geared(plant, convention, given)]
+    rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
@@ -889,6 +890,16 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
             "hardly slides (fit a law with memory, such as `dahl`)"
         )
         yield text, _unexplained(plant, given, part)
+
+
+def _unbalanced(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
+    """A rotor without weight that gravity turns once per turn."""
+    if plant.unit == "rad" and plant.joints == 1 and given.tau.any() and not weighs(plant):
+        wave = torch.stack([given.q.sin(), given.q.cos()], -1)
+        text = (
+            f"{plant.joint_names[0]} has an unbalanced mass that the rig lacks (`mass` and `com`)"
+        )
+        yield text, _unexplained(plant, given, wave)
 
 
 def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:

@@ -1099,3 +1099,9 @@ def test_a_torque_sensor_that_is_clipped_or_stuck_is_named():
     for sound in (noisy, 0.05 * np.round(noisy / 0.05), np.repeat(noisy[::5], 5, 0)[: len(q)], off,
                   np.clip(tau, -1.5, 2.0)):  # fmt: skip
         assert not named(sound)
+
+
+def test_an_unbalanced_rotor_is_named():
+    plant, q, tau = measured("wheel")
+    first = warnings_of(plant, q, tau + 0.4 * np.sin(q - 0.5))[0]
+    assert "likely: joint1 has an unbalanced mass that the rig lacks (`mass` and `com`)." in first
