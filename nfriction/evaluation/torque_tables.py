@@ -320,8 +320,8 @@ def fit_torque(
             )
         if copies := len(moving) - len(moving.distinct):
             remarks.append(
-                f"{copies} of {len(moving)} rows of {moving.name} are copies of others in all "
-                "columns, which would narrow the intervals, and are left out."
+                f"{copies} of {len(moving)} rows of {moving.name} equal others in every column, "
+                "each as often; as copies they would narrow the intervals, and are left out."
             )
     given = replace(given, joints=tuple(joint.sliding.distinct for joint in given.joints))
     fits: dict[str, tuple[torque_table.JointFit, ...]] = {}
@@ -394,12 +394,14 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
         )
         return
     low, high = np.quantile(left, (0.25, 0.75))
-    reach = max(FENCE * (high - low), small)
+    # Half a step of a coarse sensor is no error, and neighbouring readings are a step apart.
+    step = float(np.diff(np.unique(joint.tau)).min(initial=math.inf))
+    reach = max(FENCE * (high - low), small, 1.5 * step)
     far = rows[(left < low - reach) | (left > high + reach)]
     if len(far) > max(LISTED, FEW * len(rows)):
         yield (
-            f"{len(far)} of {len(rows)} torques are far off {own}, as with phases of acceleration "
-            "in the table; leave these out, or subtract inertia times acceleration."
+            f"{len(far)} of {len(rows)} torques are far off {own}, as with rows recorded while "
+            "accelerating; leave these out, or subtract inertia times acceleration."
         )
     elif len(far):
         off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:LISTED])
@@ -440,11 +442,11 @@ def _cause(
         f"The torque is {abs(sizes[0]):.3g} {'N m' if unit == 'rad' else 'N'} "
         f"{'above' if sizes[0] > 0 else 'below'} {own} in both directions, as with an offset of "
         "the sensor or a constant load; subtract it and fit again, or add arctan, which has one.",
-        f"Friction is {200 * share / (1 + share):.0f} % less in {ways[0]} than in {ways[1]} "
-        f"direction, unlike {own}; fit each direction as a joint of its own.",
+        f"Friction is {200 * share / (1 + share):.0f} % lower in the {ways[0]} direction than in "
+        f"the {ways[1]}, unlike {own}; fit each as a separate joint (column `joint`).",
         f"The error of {own} follows the acceleration, as with an inertia of {sizes[2]:.3g} "
-        f"{'kg m²' if unit == 'rad' else 'kg'}; leave out phases of acceleration, or subtract "
-        "inertia times acceleration.",
+        f"{'kg m²' if unit == 'rad' else 'kg'}; leave out rows recorded while accelerating, or "
+        "subtract inertia times acceleration.",
     )
     # In a narrow range of torques, an offset and a direction are alike.
     alike = best < 2 and not gains(left[best], left[1 - best], chance)

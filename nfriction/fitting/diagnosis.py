@@ -886,8 +886,8 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (
             f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit} that the rig lacks "
-            f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]}), or "
-            "hardly slides (fit a law with memory, such as `dahl`)"
+            f"(subtract stiffness times position from the {kind} of {plant.joint_names[j]}), or it "
+            "hardly slides and its contact is elastic (fit a law with memory, such as `dahl`)"
         )
         yield text, _unexplained(plant, given, part)
 

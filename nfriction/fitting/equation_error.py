@@ -204,11 +204,11 @@ def fit_equation_error(
 
     Linear least squares within bounds for the linear coefficients, at every combination of the
     law's initial values of the others, which are then refined. Coefficients that are not fitted
-    keep their values in `known`, (joint, coefficient), by default the initial ones. A drive has a
-    constant offset where it is significant, unless the plant is not fitted. Samples are left out if
-    their direction of motion is uncertain, or if the joint has moved by less than `beyond` times
-    its range since the last reversal. A robust loss weights the squares. Recordings and motions are
-    in joint coordinates.
+    keep their values in `known`, (joint, coefficient), by default the initial ones. A drive that
+    moves both ways has a constant offset where it is significant, unless the plant is not fitted.
+    Samples are left out if their direction of motion is uncertain, or if the joint has moved by
+    less than `beyond` times its range since the last reversal. A robust loss weights the squares.
+    Recordings and motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
@@ -225,6 +225,10 @@ def fit_equation_error(
     kept = torch.cat([p.kept for p in parts])
     if beyond:
         kept = kept & torch.cat([_travelled(torch.as_tensor(m.q)) > beyond for m in motions])
+    # In one direction, dry friction and an offset are alike.
+    ways = torch.stack([(kept & (torch.cat([p.qd for p in parts]) * way > 0)).sum(0)
+                        for way in (1, -1)])  # fmt: skip
+    both = ways.amin(0) > options.two_way * ways.sum(0)
     # A joint that hardly ever moved uses all its samples.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
@@ -234,7 +238,7 @@ def fit_equation_error(
     ]
     found = regress(law, parts, v_smooth, options, known)
     measured = [np.zeros((1, plant.joints)) if r.tau is None else r.tau for r in recordings]
-    driven = torch.as_tensor(np.concatenate(measured).any(0))
+    driven = both & torch.as_tensor(np.concatenate(measured).any(0))
     if driven.any() and options.fit_plant and "f_o" not in law.names:
         other, significant = _offset_regression(law, parts, v_smooth, options, known)
         found = found.where(driven & significant, other)

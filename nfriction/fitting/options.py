@@ -80,6 +80,8 @@ class FitOptions:
     # --- Equation error.
     # Smoothers are less accurate at the ends of a record, so this much of each is dropped [s].
     edge: float = 0.02
+    # Share of the samples in the rarer direction from which a motion goes both ways.
+    two_way: float = 0.05
     # Ridge relative to the data's information: negligible if the data are informative, and no
     # divergence if they are not (an offset and a sign that never changes).
     ridge: float = 1e-6

@@ -65,7 +65,7 @@ def prepare_task(
     if plant.has_position_load and not has_input(model.law, "position"):
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
-    inputs.require_parts(given, min(options.windows))
+    inputs.require_parts(given, 2 * options.edge)
     given = given if motions else inputs.released(given)
     joint = inputs.in_joint_coordinates(plant, given, model.joints)
     moved = inputs.smoothed_motions(joint, motions)

@@ -50,8 +50,6 @@ MINIMUM_ROWS = 8
 FAST = 60.0
 # Share of the largest velocity up to which a joint is at rest.
 RESTING = 1e-3
-# Chance level: equal rows of which fewer have a neighbour are copies.
-CHANCE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +97,18 @@ class JointTorque:
 
     @property
     def distinct(self) -> JointTorque:
-        """Unordered rows without copies, which would feign a certainty that nobody measured.
+        """Rows in no order without copies of the whole table, which would narrow intervals.
 
-        Readings of a coarse sensor are equal by chance, but then some are one step of its torque
-        apart, and not all occur a multiple of k times: there only copies of the whole table go.
+        Readings of a coarse sensor are equal by chance, but then not each a multiple of k times.
         """
         if self.time is not None:
             return self
         every = (self.q, self.qd, self.qdd, self.load, self.temperature, self.tau)
         table = np.stack([x for x in every if x is not None], 1)
-        rows, where, counts = np.unique(table, axis=0, return_inverse=True, return_counts=True)
-        gaps, step = np.diff(rows, axis=0), np.diff(np.unique(self.tau)).min(initial=math.inf)
-        near = (gaps[:, :-1] == 0.0).all(1) & (gaps[:, -1] < 1.5 * step)
-        coarse = near.sum() >= CHANCE * len(rows)
-        kept = counts // (np.gcd.reduce(counts) if coarse else counts)
+        _, where, counts = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+        kept = counts // np.gcd.reduce(counts)
+        if kept.sum() < MINIMUM_ROWS:
+            return self
         order = np.argsort(where.ravel(), kind="stable")
         repeat = np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.rows(np.sort(order[repeat < np.repeat(kept, counts)]))
@@ -213,21 +209,21 @@ class TorqueTable:
         table = table.set_axis([str(name) for name in table.columns], axis=1)
         sources = _sources(table, columns or {})
         _require_unit(unit, sources)
-        remarks: list[str] = []
-        if torque and ("time", 0) in sources:
-            # Without time, equal rows need not be copies: `JointTorque.distinct` judges.
-            given = len(table)
-            table = table.drop_duplicates([column for column, _ in sources.values()])
-            if len(table) < given:
-                remarks.append(
-                    f"{given - len(table)} of {given} rows are copies of others, time included, "
-                    "and are left out."
-                )
         values = {
             key: _numbers(table, key[0], *source, degrees=degrees)
             for key, source in sources.items()
             if key[0] != "joint"
         }
+        remarks: list[str] = []
+        if torque and ("time", 0) in sources:
+            # Without time, equal rows need not be copies: `JointTorque.distinct` judges.
+            first = ~table.duplicated([column for column, _ in sources.values()]).to_numpy()
+            if copies := int((~first).sum()):
+                remarks.append(
+                    f"{copies} of {len(table)} rows equal others in every column, time included, "
+                    "and are left out."
+                )
+            table, values = table[first], {key: x[first] for key, x in values.items()}
         names: list[str] = []
         parts: list[dict[str, Array | None]] = []
         for name, rows, number in _parts(table, sources, torque):

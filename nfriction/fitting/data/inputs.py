@@ -46,7 +46,7 @@ TURN_SHARE = 1e-3
 ALIKE = 0.02
 # Expected number of chance events above which an event proves nothing.
 UNLIKELY = 0.01
-# Share of samples whose errors are lost among the others; buses are late for a few samples.
+# Share of held samples up to which they do not matter; a bus may repeat a few.
 FEW = 0.01
 # Shares of its range that a joint has moved just after its release, the second four times the
 # first.
@@ -119,12 +119,15 @@ def _dry_friction(plant: Plant, pairs: Sequence[tuple[Recording, Motion]]) -> Ar
     for r, m in pairs:
         needed = plant.inverse_dynamics(*map(torch.as_tensor, (m.q, m.qd, m.qdd)))
         taken.append((0.0 if r.tau is None else r.tau) - needed.numpy())
-    columns = zip(qd.T, np.concatenate(taken).T, strict=True)
-    # Beside viscous friction and a constant torque, such as a weight or a sensor's bias. At rest
-    # the direction is that of the noise, and the power is none.
-    found = [
-        np.linalg.lstsq(np.stack([v, v * abs(v), abs(v)], 1), f * abs(v))[0][0] for v, f in columns
-    ]
+    driven = largest_torques([r for r, _ in pairs]) > 0
+    found = []
+    for v, f, drive in zip(qd.T, np.concatenate(taken).T, driven, strict=True):
+        shapes = [v, v * abs(v)]
+        # A constant torque, such as a weight or a sensor's bias, if both ways show it.
+        if drive and min(np.mean(v > 0), np.mean(v < 0)) > DEFAULTS.two_way:
+            shapes.append(abs(v))
+        # At rest the direction is that of the noise, and the power is none.
+        found.append(np.linalg.lstsq(np.stack(shapes, 1), f * abs(v))[0][0])
     return np.clip(found, 0.0, None)
 
 
@@ -154,17 +157,16 @@ def _refuse_repeated(recordings: Sequence[Recording]) -> None:
 
 
 def require_parts(recordings: Sequence[Recording], shortest: float) -> None:
-    """Refuse a recording with many gaps between which no part is as long as a window [s]."""
+    """Refuse a recording with many gaps and no part between them of this length [s]."""
     for k, recording in enumerate(recordings):
         parts, count = recording.segments, len(gaps(recording.time))
         longest = max((recording.time[b] - recording.time[a] for a, b in parts), default=0.0)
-        # A few short parts may remain where blocks are left out.
         if count >= MINIMUM_SAMPLES and longest < shortest:
             raise ValueError(
                 f"`time` of {recording.name or f'recording {k + 1}'} has {count} gaps, and its "
-                f"longest part without one is {longest:.3g} s, shorter than the shortest window of "
-                f"{shortest:g} s. If a logger stamps its rows in batches, give them even times, as "
-                "`numpy.linspace(t[0], t[-1], len(t))`."
+                f"longest part without one is {longest:.3g} s, too short for a velocity (at least "
+                f"{shortest:g} s). If a logger stamps its rows in batches, give them even times, "
+                "as `numpy.linspace(t[0], t[-1], len(t))`."
             )
 
 
@@ -584,15 +586,16 @@ def _torque_spikes(recordings: Sequence[Recording], options: FitOptions) -> Iter
 
 
 def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
-    """Torques with noise that hold a value for longer than chance explains, except 0.
+    """Torques with noise that hold a nonzero value of a moving joint for longer than by chance.
 
-    A drive that is off may be logged as 0. Without noise a torque is a command, which may be held.
+    A drive that is off may be logged as 0. Without noise a torque is a command, which may be held,
+    as is that of a controller while the encoder shows no motion.
     """
     for recording in recordings:
-        columns = (
-            () if recording.tau is None else zip(recording.names, recording.tau.T, strict=True)
-        )
-        for name, torque in columns:
+        if recording.tau is None:
+            continue
+        columns = zip(recording.names, recording.tau.T, recording.q.T, strict=True)
+        for name, torque, q in columns:
             edges = np.flatnonzero(np.diff(torque, prepend=np.nan, append=np.nan))
             value, length = torque[edges[:-1]], np.diff(edges)
             # Differences of a smooth signal shrink with their order, those of noise grow.
@@ -602,7 +605,9 @@ def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
             usual = length[length < MINIMUM_SAMPLES]
             same = (usual.sum() - len(usual)) / max(usual.sum(), 1)
             chance = math.log(UNLIKELY / len(torque)) / math.log(same) if same else 0
-            held = (length > max(MINIMUM_SAMPLES, chance)) & (value != 0)
+            count = np.nan_to_num(count_seen(q[:, None]))
+            turned = np.abs(q[edges[1:] - 1] - q[edges[:-1]]) > 2 * count
+            held = (length > max(MINIMUM_SAMPLES, chance)) & (value != 0) & turned
             share = length[held].sum() / len(torque)
             if share < FEW:
                 continue

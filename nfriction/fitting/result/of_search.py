@@ -69,14 +69,20 @@ def result_from_equation_error(
     )
     rig = start.plant if start else plant
     largest = _largest_friction(model, rig, motions)
+    total = rig.torque_offset + torque.offset
     offsets = tuple(
-        _one_way(rig, joint, True, float(rig.torque_offset[joint] + change), largest)
-        for joint, change in enumerate(torque.offset.tolist()) if change
-    )  # fmt: skip
+        _one_way(rig, joint, True, float(total[joint]), largest)
+        for joint in (total != plant.torque_offset).nonzero().flatten().tolist()
+    )
+    kind = "force" if plant.unit == "m" else "torque"
+    changes = {f"{kind} offset {j + 1}": x for j, x in enumerate(torque.offset.tolist())}
     return FitResult(
         model=model.requires_grad_(False),
-        plant=rig.replace(torque_offset=rig.torque_offset + torque.offset) if offsets else rig,
-        plant_terms=start.plant_terms if start else (),
+        plant=rig.replace(torque_offset=total) if torque.offset.any() else rig,
+        plant_terms=tuple(
+            (name, value + changes.get(name.partition(" [")[0], 0.0), bound)
+            for name, value, bound in (start.plant_terms if start else ())
+        ),
         status="Converged: linear least squares of the torque.",
         converged=True,
         residual=float(torque.residual.square().mean().sqrt()),
@@ -162,7 +168,8 @@ def result_from_shooting(
         + identifiability.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
-        + (scaled or rig or (PROPORTIONAL,) * (not problem.windows.tau.any()))
+        + (scaled or (PROPORTIONAL,) * (not problem.windows.tau.any()))
+        + rig
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
@@ -223,33 +230,30 @@ def rig_warning(
 ) -> tuple[tuple[str, ...], bool]:
     """A sentence if the fit changes the rig by more than its data usually err, and friction too.
 
-    That is by more than the prior's standard deviation; the flag says if the change is beyond the
-    95 % of the prior. With recorded torques only a single term scales with them.
+    That is by more than the prior's standard deviation; the flag is true if the change is beyond
+    95 % of the prior. With recorded torques, only the friction beside a single inertia or mass
+    scales with them.
     """
     plant, driven = problem.jacobian.plant, bool(problem.windows.tau.any())
-    terms = {t.name: t for t in problem.variables.terms if t.ratio}
-    sure = [i for i in intervals if i.name in terms and i.low * i.high > 0]
-    if driven:
-        weights = [i for i in sure if i.name.startswith(("inertia", "mass"))]
-        every = [*_relative_weights(plant, intervals)] or weights
-        sure = weights if len(every) == 1 else []
-    sizes = [abs(i.value) / terms[i.name].prior_sd for i in sure]
-    if not sizes or max(sizes) <= 1:
+    weights = [
+        i for i in intervals
+        if i.name.startswith(("inertia", "gravity", "mass")) and i.low * i.high > 0
+    ]  # fmt: skip
+    if driven and len([*_relative_weights(plant, intervals)] or weights) > 1:
         return (), False
-    worst, far = sure[int(np.argmax(sizes))], max(sizes) > identifiability.NORMAL_95
-    name, scale = worst.name, 1 + worst.value
-    changed = f"{name[0].upper()}{name[1:]} is {scale:.3g} times that of the rig. "
-    if driven:
-        cause = (
-            f"Either the rig is wrong, or torques are recorded {scale:.3g} times as large as they "
-            "are (torque constant, gear ratio, unit); then so is the friction."
-        )
-    else:
-        cause = (
-            "So its masses, inertias, lengths or centres of mass do not agree. Without a recorded "
-            "torque friction is in proportion to them, and may be wrong by as much."
-        )
-    return (changed + cause,), far
+    sd = problem.options.ratio_term[1]
+    worst = max(weights, key=lambda i: abs(i.value), default=None)
+    if worst is None or abs(worst.value) <= sd:
+        return (), False
+    term, _, place = worst.name.partition(" ")
+    joint, scale = plant.joint_names[int(place[0]) - 1 + plant.first_link], 1 + worst.value
+    text = f"The {term} of {joint} is {scale:.3g} times that of the rig. " + (
+        f"Either the rig is wrong, or torques are recorded {scale:.3g} times as large as they are "
+        "(torque constant, gear ratio, unit); then so is the friction." if driven else
+        "The masses, inertias and centres of mass of the rig do not agree with the motion; the "
+        "friction is in proportion to them."
+    )  # fmt: skip
+    return (text,), abs(worst.value) > identifiability.NORMAL_95 * sd
 
 
 def rotor_warning(
@@ -300,11 +304,12 @@ def _one_way(plant: Plant, joint: int, constant: bool, value: float, largest: Te
     cause = f"may equally be friction that is {2 * abs(value):.3g} {unit} larger {way}"
     if constant and abs(value) > largest[joint]:
         cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
-    unless = "unless it is a sensor's bias, add" if constant else "add"
+    remedy = f"add {-value:.3g} {unit} to a command"
+    if constant:
+        remedy += ", but not if it is a sensor's bias"
     return (
         f"The fitted plant has a {kind} of {value:.3g} {unit} at {plant.joint_names[joint]}, which "
-        f"{cause}. The friction model and its exports lack it: {unless} {-value:.3g} {unit} to a "
-        "command."
+        f"{cause}. The friction model and its exports lack it: {remedy}."
     )
 
 

@@ -122,11 +122,12 @@ def fit_constant(task: FitTask) -> FitResult:
 
 def _begin(task: FitTask, fitter: ShootingFitter, torque: TorqueFit) -> Tensor:
     """Plant terms at the start: those of an earlier fit, and offsets that the torques imply."""
-    terms = fitter.jacobian.terms
+    terms, begun = fitter.jacobian.terms, task.start.plant if task.start else task.plant
     begin = known_terms(task.start, terms, task.delay)
+    offsets = begun.torque_offset + torque.offset - task.plant.torque_offset
     for k, term in enumerate(terms):
         if "torque_offset" in term.change:
-            value = begin[k] + torque.offset[int(term.change["torque_offset"].argmax())]
+            value = offsets[int(term.change["torque_offset"].argmax())]
             begin[k] = value.clamp(term.lower, term.upper)
     return begin
 
