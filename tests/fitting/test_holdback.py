@@ -16,9 +16,9 @@ from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
     cut_for_folds,
     holdout_splits,
-    holdout_squares,
     holdout_windows,
     recording_splits,
+    settled,
 )
 from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -55,7 +55,7 @@ def splits(fitter, motions, length, cut=holdout_windows):
 
 
 def rmse(*args):
-    return float(holdout_squares(*args).mean().sqrt())
+    return float(settled(*args)[0].mean().sqrt())
 
 
 def vector(fitter):
@@ -177,11 +177,11 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     def squares(test, problem, *_):
         law = torch.ones(len(test), dtype=F64)
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return law
+            return law, None
         # Better on some windows, worse on others.
-        return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64))
+        return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64)), None
 
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model
@@ -190,6 +190,19 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(14, 1)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
+
+
+def test_a_window_is_also_judged_from_the_states_of_another_model(constant, monkeypatch):
+    """From smoothed ones the search may end in another minimum of a long window."""
+    search, motions = refinement(constant), constant[1].motions
+    ((_, test),) = splits(search, motions, 0.1)[:1]
+    problem = search.problem(test, 1e-3, vector(search))
+    given = test, problem, vector(search), problem.variables.start().new_zeros(0)
+    squares, states = settled(*given)
+    torch.testing.assert_close(settled(*given, states)[0], squares, rtol=1e-3, atol=0)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settle_states", lambda _, x: (x, False))
+    assert torch.equal(settled(*given, 2 * states)[1], 2 * states)
+    assert (settled(*given, 2 * states)[0] > squares).all()
 
 
 def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):

@@ -59,12 +59,12 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
 
     def squares(test, problem, *_):
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return torch.ones(len(test))
+            return torch.ones(len(test)), None
         seen.append(float(problem.friction_prior[1][0]))
         found = seen[-1] == pytest.approx(0.6 * PRIOR_SHARES[best])
-        return torch.full((len(test),), 0.5 - 0.2 * found)
+        return torch.full((len(test),), 0.5 - 0.2 * found), None
 
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, one_link(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     tried = len(PRIOR_SHARES)
@@ -86,10 +86,10 @@ def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
     def rms(test, problem, *_):
         long = test.length > 0.4
         if isinstance(problem.friction.schedule, NeuroFuzzy):
-            return torch.full((len(test),), longer if long else 0.5).square()
-        return torch.full((len(test),), 2.0 if long else 1.0).square()
+            return torch.full((len(test),), longer if long else 0.5).square(), None
+        return torch.full((len(test),), 2.0 if long else 1.0).square(), None
 
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", rms)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", rms)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     found = fit(model, one_link(), recording, start=law, **BRIEF, fit_plant=False)
     assert bool(model.schedule.parameter_vector().any()) is kept
@@ -119,12 +119,12 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     law = fit(NCFM(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
 
-    def squares(test, problem, friction, plant):
+    def squares(test, problem, friction, plant, *_):
         # Any network beats the law, and none another, so that no gain lets the plant go.
         learns = isinstance(problem.friction.schedule, NeuroFuzzy)
-        return torch.full((len(test),), 0.5 if learns else 1.0)
+        return torch.full((len(test),), 0.5 if learns else 1.0), None
 
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
 
     def moved() -> float:
         """By how many standard deviations that the law's fit left open, at most."""
@@ -153,16 +153,16 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     def network_sd(problem):
         return None if problem.friction_prior is None else float(problem.friction_prior[1][0])
 
-    def squares(test, problem, friction, plant):
+    def squares(test, problem, friction, plant, *_):
         found = torch.ones(len(test))
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return found
+            return found, None
         seen.append((expected(problem), network_sd(problem), friction, plant))
         first = 1.0 if network_sd(problem) == seen[0][1] else 1.01
         if expected(problem) == seen[0][0]:
-            return 0.5 * first * found
+            return 0.5 * first * found, None
         # Less over all; but a gain only where it is less on every window.
-        return 0.4 * first * (found if freed else torch.linspace(0.1, 1.9, len(test)))
+        return 0.4 * first * (found if freed else torch.linspace(0.1, 1.9, len(test))), None
 
     def search(self, problem, start, *others):
         parts = problem.variables.split(start)
@@ -170,7 +170,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
         return searched(self, problem, start, *others)
 
     searched = ShootingFitter.search
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     fit(model, one_link(), recording, start=law, **BRIEF)
@@ -196,14 +196,14 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
 
     def squares(test, problem, *_):
         by_network = isinstance(problem.friction.schedule, NeuroFuzzy)
-        return torch.full((len(test),), 1.0 if by_network else math.inf)
+        return torch.full((len(test),), 1.0 if by_network else math.inf), None
 
     def search(self, problem, *others):
         trained.append(problem.plant_prior[1].tolist())
         return searched(self, problem, *others)
 
     searched = ShootingFitter.search
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.holdout_squares", squares)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
     fit(NFLFM(1, v_smooth=V_SMOOTH, **SMALL), one_link(), recording, start=law, **BRIEF)
     free, near = trained[0], trained[DEFAULTS.folds]
