@@ -61,18 +61,15 @@ class TorqueFit:
 
     def where(self, chosen: Tensor, other: "TorqueFit") -> "TorqueFit":
         """The same with the chosen joints from another regression, (joint,)."""
-
-        def joined(own: Tensor, others: Tensor, trailing: int = 0) -> Tensor:
-            return torch.where(chosen[(..., *[None] * trailing)], others, own)
-
-        return TorqueFit(
-            joined(self.coefficients, other.coefficients, 1),
-            joined(self.residual, other.residual),
-            self.torque,
-            joined(self.starts, other.starts, 1),
-            joined(self.information, other.information, 2),
-            joined(torch.zeros_like(other.offset), other.offset),
-            joined(self.weight, other.weight),
+        rows = chosen[:, None]
+        return replace(
+            self,
+            coefficients=torch.where(rows, other.coefficients, self.coefficients),
+            residual=torch.where(chosen, other.residual, self.residual),
+            starts=torch.where(rows, other.starts, self.starts),
+            information=torch.where(rows[..., None], other.information, self.information),
+            offset=torch.where(chosen, other.offset, self.offset),
+            weight=torch.where(chosen, other.weight, self.weight),
         )
 
 
@@ -265,11 +262,11 @@ def _offset_regression(
     constant = Coefficient("offset", "N m", positive=False)
     wider = Law(law.name, (*law.coefficients, constant), torque)
     found = regress(wider, parts, v_smooth, options, None if known is None else pad(known, [0, 1]))
-    values, known_of = found.coefficients[:, -1], found.information
-    sd = [standard_deviations(Information(x, 0.0 * x[0]))[-1] for x in known_of]
+    values, both = found.coefficients[:, -1], found.information
+    sd = [standard_deviations(Information(x, 0.0 * x[0]))[-1] for x in both]
     # Information about the coefficients with the offset unknown.
-    across = known_of[:, :-1, -1:]
-    alone = known_of[:, :-1, :-1] - across @ across.mT / known_of[:, -1:, -1:]
+    across = both[:, :-1, -1:]
+    alone = both[:, :-1, :-1] - across @ across.mT / both[:, -1:, -1:]
     found = replace(
         found, coefficients=found.coefficients[:, :-1], starts=found.starts[..., :-1],
         information=alone, offset=values,

@@ -165,7 +165,7 @@ class Sensitivity:
             joints, outputs, count = mix.shape[1], mix.shape[-1], features.shape[-1]
             shape = (joints, outputs, count) if features.ndim == 3 else (joints, count)
             columns = slice(place, place := place + math.prod(shape))
-            # (block, joint, row, ...); NumPy's products write there, those of torch are copied.
+            # (block, joint, row, ...); NumPy's products write there, torch's would be copied.
             found = out[..., columns].unflatten(-1, shape).transpose(1, 2)
             constant = mix.stride(0) == features.stride(0) == 0  # over the samples
             left, right = mixed[id(mix)], features.unflatten(0, (blocks, samples)).transpose(1, 2)

@@ -213,7 +213,10 @@ class Anfis(LinearOutputModule):
 
     @torch.no_grad()
     def input_jacobian(self, x: Tensor, columns: Tensor | None = None) -> Tensor:
-        """In closed form: the rules' slopes, and Q dlog m / dx of the sets (`jacobian_columns`)."""
+        """In closed form: the rules' slopes, and Q dlog m / dx of the sets.
+
+        `columns` are `jacobian_columns` of the same inputs, if they are known.
+        """
         shared, own = self._column_counts
         columns = self.jacobian_columns(x) if columns is None else columns
         rules, by_set = columns.tensor_split([shared], 1)

@@ -230,9 +230,8 @@ def rig_warning(
 ) -> tuple[tuple[str, ...], bool]:
     """A sentence if the fit changes the rig by more than its data usually err, and friction too.
 
-    That is by more than the prior's standard deviation; the flag is true if the change is beyond
-    95 % of the prior. With recorded torques, only the friction beside a single inertia or mass
-    scales with them.
+    More is beyond the prior's standard deviation; the flag is true beyond 95 % of the prior. With
+    recorded torques, friction follows such an error only beside a single inertia or mass.
     """
     plant, driven = problem.jacobian.plant, bool(problem.windows.tau.any())
     weights = [

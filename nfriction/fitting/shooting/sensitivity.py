@@ -152,7 +152,7 @@ def propagate(
     joints, state = run.motion.q.shape[-1], run.state
     parameters = run.friction.schedule.parameter_vector().numel()
     counts = (0, 0) if states else (parameters, len(run.plant_vector))
-    shared, friction_count = sum(counts), counts[0]
+    (friction_count, plant_count), shared = counts, sum(counts)
     own = state.shape[-1]
     carried = torch.zeros(windows, own + joints, shared + own, dtype=torch.float64)
     carried[:, :own, shared:] = torch.eye(own, dtype=torch.float64)
@@ -164,7 +164,7 @@ def propagate(
     carried[:, own:, motion], by_plant = jacobian.initial_acceleration(
         run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
     ).tensor_split([2 * joints], -1)
-    carried[:, own:, friction_count:shared] = by_plant[..., : counts[1]]
+    carried[:, own:, friction_count:shared] = by_plant[..., :plant_count]
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
