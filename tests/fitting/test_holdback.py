@@ -55,7 +55,7 @@ def splits(fitter, motions, length, cut=holdout_windows):
 
 
 def rmse(*args):
-    return float(settled(*args)[0].mean().sqrt())
+    return float(settled(*args).mean().sqrt())
 
 
 def vector(fitter):
@@ -177,9 +177,9 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     def squares(test, problem, *_):
         law = torch.ones(len(test), dtype=F64)
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return law, None
+            return law
         # Better on some windows, worse on others.
-        return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64)), None
+        return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64))
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
@@ -192,17 +192,28 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_a_window_is_also_judged_from_the_states_of_another_model(constant, monkeypatch):
-    """From smoothed ones the search may end in another minimum of a long window."""
-    search, motions = refinement(constant), constant[1].motions
-    ((_, test),) = splits(search, motions, 0.1)[:1]
-    problem = search.problem(test, 1e-3, vector(search))
-    given = test, problem, vector(search), problem.variables.start().new_zeros(0)
-    squares, states = settled(*given)
-    torch.testing.assert_close(settled(*given, states)[0], squares, rtol=1e-3, atol=0)
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settle_states", lambda _, x: (x, False))
-    assert torch.equal(settled(*given, 2 * states)[1], 2 * states)
-    assert (settled(*given, 2 * states)[0] > squares).all()
+def test_windows_start_at_the_states_of_the_fit(constant):
+    """From smoothed ones a search may end in another minimum of a long window."""
+    joint, found = constant
+    search = refinement(constant)
+    windows = search.cut(found.motions, 0.5)
+    law = vector(replace(search, friction=found.model))
+    problem = replace(search, friction=found.model).problem(found.started(windows), 1e-3, law)
+    errors = problem.errors(problem.variables.start())
+    torch.testing.assert_close(errors, found.residuals, rtol=0, atol=1e-12)
+    # Others keep theirs.
+    other = search.cut(found.motions, 0.3)
+    assert found.started(other) is other
+
+
+def test_a_law_fitted_to_other_recordings_is_fitted_again(constant):
+    joint, found = constant
+    half = joint[: len(joint) // 2]
+    kept = fit(
+        NFLFM(1, v_smooth=V_SMOOTH, **SMALL), one_link(), half, start=found, windows=(0.5,),
+        fit_plant=False, max_steps=1,
+    )  # fmt: skip
+    assert len(kept.residuals) < len(found.residuals)
 
 
 def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):

@@ -1,6 +1,7 @@
 """Inputs of friction besides the speed are chosen by evidence, and have to win on hold-out."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,6 +96,18 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         torch.testing.assert_close(refitted.plant.load_waves, WAVES)
         off = (refitted.plant.load_phase - PHASES + math.pi) % (2 * math.pi) - math.pi
         assert off.abs().max() < 0.1
+
+
+def test_the_law_with_inputs_starts_where_the_law_ended() -> None:
+    """Smoothed states may lead to another minimum, in which every input seems to help."""
+    plant, brief = pendulum(), {**BRIEF, "windows": (0.5, 1.5)}
+    recording = swing(plant, truth("direction"), seconds=3.0)
+    law = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recording, **brief)
+    model = NFCVFM(2, v_smooth=V_SMOOTH)
+    task = prepare_task(model, plant, [recording], FitOptions(**brief))
+    turned = tuple(replace(motion, q=motion.q + [3.0, -3.0]) for motion in task.motions)
+    found = widened_start(replace(task, motions=turned), law, ["direction"])
+    assert found.residual < law.residual
 
 
 @pytest.mark.slow

@@ -59,10 +59,10 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
 
     def squares(test, problem, *_):
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return torch.ones(len(test)), None
+            return torch.ones(len(test))
         seen.append(float(problem.friction_prior[1][0]))
         found = seen[-1] == pytest.approx(0.6 * PRIOR_SHARES[best])
-        return torch.full((len(test),), 0.5 - 0.2 * found), None
+        return torch.full((len(test),), 0.5 - 0.2 * found)
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
@@ -86,8 +86,8 @@ def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
     def rms(test, problem, *_):
         long = test.length > 0.4
         if isinstance(problem.friction.schedule, NeuroFuzzy):
-            return torch.full((len(test),), longer if long else 0.5).square(), None
-        return torch.full((len(test),), 2.0 if long else 1.0).square(), None
+            return torch.full((len(test),), longer if long else 0.5).square()
+        return torch.full((len(test),), 2.0 if long else 1.0).square()
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", rms)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
@@ -122,7 +122,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     def squares(test, problem, friction, plant, *_):
         # Any network beats the law, and none another, so that no gain lets the plant go.
         learns = isinstance(problem.friction.schedule, NeuroFuzzy)
-        return torch.full((len(test),), 0.5 if learns else 1.0), None
+        return torch.full((len(test),), 0.5 if learns else 1.0)
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
 
@@ -156,13 +156,13 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     def squares(test, problem, friction, plant, *_):
         found = torch.ones(len(test))
         if not isinstance(problem.friction.schedule, NeuroFuzzy):
-            return found, None
+            return found
         seen.append((expected(problem), network_sd(problem), friction, plant))
         first = 1.0 if network_sd(problem) == seen[0][1] else 1.01
         if expected(problem) == seen[0][0]:
-            return 0.5 * first * found, None
+            return 0.5 * first * found
         # Less over all; but a gain only where it is less on every window.
-        return 0.4 * first * (found if freed else torch.linspace(0.1, 1.9, len(test))), None
+        return 0.4 * first * (found if freed else torch.linspace(0.1, 1.9, len(test)))
 
     def search(self, problem, start, *others):
         parts = problem.variables.split(start)
@@ -196,7 +196,7 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
 
     def squares(test, problem, *_):
         by_network = isinstance(problem.friction.schedule, NeuroFuzzy)
-        return torch.full((len(test),), 1.0 if by_network else math.inf), None
+        return torch.full((len(test),), 1.0 if by_network else math.inf)
 
     def search(self, problem, *others):
         trained.append(problem.plant_prior[1].tolist())

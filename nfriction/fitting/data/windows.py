@@ -25,7 +25,7 @@ class Windows:
         tau: torque held over each step [N m; N], (window, step, joint).
         step: [s], (window, step); zero where a window ends early.
         weight: 1 for a sample, 0 for padding, (window, step + 1).
-        q0, qd0: smoothed initial state, (window, joint).
+        q0, qd0: initial state, from the smoothed motion or a search, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
         recordings, motions: from which the windows are cut, in joint coordinates.
@@ -66,6 +66,14 @@ class Windows:
             law_state=None if self.law_state is None else self.law_state[index],
             hidden_state=None if self.hidden_state is None else self.hidden_state[index],
         )  # fmt: skip
+
+    def starting_at(self, states: Tensor) -> "Windows":
+        """The windows from these positions and velocities, (window, ...), unless they are known."""
+        joints = self.q0.shape[-1]
+        q0, qd0 = (x.clone() for x in states[:, : 2 * joints].chunk(2, -1))
+        known = list(self.at_rest)
+        q0[known], qd0[known] = self.q0[known], self.qd0[known]
+        return replace(self, q0=q0, qd0=qd0)
 
     def with_states(self, plant: Plant, model: FrictionModel) -> "Windows":
         """The windows with the state of the friction at the start of each.

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY
 from nfriction.fitting.data.inputs import advanced_torques, weighs
+from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
@@ -80,6 +81,8 @@ class FitResult:
         motions: smoothed motion of each recording, in joint coordinates.
         residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
             after an equation-error fit.
+        window_states: position and velocity at the start of each training window, (window,
+            2 joint) [rad, rad/s; m, m/s], without encoder offsets; empty like `residuals`.
         intervals: 95 % confidence intervals of constant coefficients and plant terms, from the
             effective sample size of autocorrelated residuals. After an equation-error fit they
             assume that the plant and the smoothed motion are exact.
@@ -113,6 +116,7 @@ class FitResult:
     steps: int
     motions: tuple[Motion, ...]
     residuals: Tensor
+    window_states: Tensor
     intervals: tuple[Interval, ...] = ()
     unidentifiable: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -132,6 +136,14 @@ class FitResult:
         """The longest of growing window lengths that the constant law could follow [s]."""
         usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
         return usable[-1] if usable else windows[0]
+
+    def started(self, windows: Windows) -> Windows:
+        """Windows of the same recordings from the states of the fit, if it had the same windows.
+
+        From smoothed states a search may miss the minimum of a long window.
+        """
+        same = self.residuals.shape == windows.q.shape
+        return windows.starting_at(self.window_states) if same else windows
 
     def with_warnings(
         self,

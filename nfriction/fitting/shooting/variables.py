@@ -144,6 +144,12 @@ class DecisionVariables:
         offsets = self.split(x).offsets
         return offsets[self._recording()] if len(offsets) else torch.zeros_like(self.windows.q0)
 
+    def true_states(self, x: Tensor) -> Tensor:
+        """Positions without encoder offsets and velocities at the starts, (window, 2 joint)."""
+        states, offsets = self.split(x).states, self.window_offsets(x)
+        joints = offsets.shape[-1]
+        return torch.cat([states[:, :joints] + offsets, states[:, joints : 2 * joints]], 1)
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds; equal for variables that are not fitted."""
         lower, upper = self.schedule.bounds()

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms
-from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import TorqueFit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
@@ -162,7 +161,7 @@ def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[
 def constant_start(task: FitTask) -> FitResult:
     """The constant fit of a model's law; `task.start` if it is such a fit to these recordings."""
     model, start = task.model, task.start
-    if is_constant_fit(start, model) and _offsets_match(start, task):
+    if is_constant_fit(start, model) and _same_recordings(start, task):
         return start
     # With its values of coefficients that are not fitted.
     values = model.schedule.coefficient_sets().get("always")
@@ -170,13 +169,12 @@ def constant_start(task: FitTask) -> FitResult:
     return fit_constant(replace(task, model=constant)).with_warnings(task.data_warnings)
 
 
-def _offsets_match(start: FitResult, task: FitTask) -> bool:
-    """True if a fit has encoder offsets for exactly these recordings, or has and needs none."""
-    if not task.per_recording:
-        return not start.encoder_offsets
+def _same_recordings(start: FitResult, task: FitTask) -> bool:
+    """True if a fit is to exactly these recordings, with encoder offsets only if the task has."""
     pairs = zip(start.motions, task.motions, strict=False)
-    same = all(np.array_equal(a.q, b.q) for a, b in pairs)
-    return len(start.encoder_offsets) == len(task.motions) and same
+    same = len(start.motions) == len(task.motions)
+    same = same and all(np.array_equal(a.q, b.q) for a, b in pairs)
+    return same and bool(start.encoder_offsets) == task.per_recording
 
 
 def warm_start_from_nested(
@@ -214,7 +212,8 @@ def best_of_starts(
     """
     if nested.stopped:
         return own.as_stopped()
-    windows, options, law = _windows_from(nested), fitter.options, fitter.friction.law
+    options, law = fitter.options, fitter.friction.law
+    windows = nested.problem.windows.starting_at(nested.parts.states)
     same = windows.spans == own.problem.windows.spans
     # If one of the two failed at the longest windows, their residuals cannot be compared.
     if not same and len(windows) >= len(own.problem.windows):
@@ -252,17 +251,6 @@ def best_of_starts(
         if found.stopped:
             return best.as_stopped()
     return best
-
-
-def _windows_from(found: HorizonResult) -> Windows:
-    """The windows of a stage, starting at the states that it found unless these are known."""
-    windows = found.problem.windows
-    states = found.problem.variables.split(found.result.x).states
-    joints = windows.q0.shape[-1]
-    q0, qd0 = (x.clone() for x in states[:, : 2 * joints].chunk(2, -1))
-    known = list(windows.at_rest)
-    q0[known], qd0[known] = windows.q0[known], windows.qd0[known]
-    return replace(windows, q0=q0, qd0=qd0)
 
 
 def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:

@@ -85,25 +85,20 @@ def settled(
     problem: ShootingProblem,
     friction: Tensor,
     plant: Tensor,
-    states: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> Tensor:
     """Mean squared error on each window [rad^2; m^2], (window,), from its best initial state.
 
     The errors of smoothed states exceed the difference between two laws. Infinite where the motion
     diverges. The problem is that of other windows with the same friction model and plant, whose
-    parameters are given. Also returns the initial states and encoder offsets, (variable,), from
-    which another search may start.
+    parameters are given.
 
     Raises:
         StoppedError: if the search for the initial states was interrupted.
     """
     model = model_at(problem.friction, friction)
     judged = replace(problem, windows=test.with_states(problem.jacobian.plant, model))
-    start, count = judged.variables.start(plant, friction=friction), judged.variables.shared_count
-    if states is not None:
-        start = torch.cat([start[:count], states])
-    x, stopped = settle_states(judged, start)
+    x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
     if stopped:
         raise StoppedError
     squares = judged.counted_errors(x).square().mean((1, 2)).nan_to_num(nan=math.inf)
-    return squares.clamp_min(problem.options.min_noise**2), x[count:]
+    return squares.clamp_min(problem.options.min_noise**2)

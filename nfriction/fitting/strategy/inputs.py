@@ -228,18 +228,21 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     ends: list[HorizonResult] = []
 
     def residual(log_time: float) -> float:
-        """Residual of a search with this cooling time, started from the end of the previous one."""
+        """Residual of a search with this cooling time, started from the best of those before."""
         fitter = widened_fitter(task, start, inputs, math.exp(log_time))
         friction = fitter.friction.schedule.parameter_vector()
         plant, residuals = known_terms(start, fitter.jacobian.terms), start.residuals
+        windows = start.started(fitter.cut(task.motions, horizon))
         # With the noise of the law without inputs, a first search is pulled toward the prior, and
         # its windows start with the heat of the previous friction.
         for _ in range(1 if ends else 2):
             if ends:
-                (friction, plant, *_), residuals = ends[-1].parts, ends[-1].residuals
+                lowest = min(ends, key=lambda end: end.rms)
+                (friction, plant, states, _), residuals = lowest.parts, lowest.residuals
+                windows = windows.starting_at(states)
             noise = max(effective_noise(residuals), task.options.min_noise)
             tolerance = loglik_tolerance(weighted_cost(residuals, noise), task.options)
-            problem = fitter.problem(fitter.cut(task.motions, horizon), noise, friction)
+            problem = fitter.problem(windows, noise, friction)
             x, stopped = settle_states(problem, problem.variables.start(plant))
             end = fitter.search(problem, x, tolerance, "law with further inputs")
             if stopped or end.stopped or not math.isfinite(end.rms):
@@ -331,7 +334,8 @@ class _Choice:
     def of(
         cls, fitter: ShootingFitter, task: FitTask, start: FitResult, names: Mapping[str, str]
     ) -> "_Choice | None":
-        windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
+        horizon = start.longest_usable_horizon(task.options.windows)
+        windows = start.started(fitter.cut(task.motions, horizon))
         noise, model = effective_noise(start.residuals), fitter.friction
         stride = decimation(start.residuals, task.options)
         values = model.schedule.parameter_vector()

@@ -36,6 +36,7 @@ from nfriction.fitting.strategy.continuation import (
     HorizonResult,
     ShootingFitter,
     loglik_tolerance,
+    settle_states,
     weighted_cost,
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
@@ -379,10 +380,10 @@ class Validation:
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
     ) -> None:
         assert law.plant_prior is not None
-        self.law, self.motions, self.length, self.options = law, motions, length, law.options
+        self.law, self.length, self.options = law, length, law.options
         self.plant = law.plant_prior[0]
-        self.windows = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
-        self.splits = holdout.holdout_splits(self.windows, self.options.folds)
+        self.cut = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
+        self.of_start = start.started(law.cut(motions, length))
         # The noise that sets the weight of the priors is the residual of the constant law at the
         # same horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
@@ -391,6 +392,21 @@ class Validation:
         self.explained = self.options.explained_ratio * (start.noise or 0.0)
         cost = weighted_cost(start.residuals, self.noise)
         self.tolerance = loglik_tolerance(cost, self.options)
+
+    @cached_property
+    def windows(self) -> Windows:
+        """Hold-out windows from the best states of the law, as smoothed ones may be far off."""
+        values = self.law.friction.schedule.parameter_vector()
+        problem = self.law.problem(self.cut, self.noise, values)
+        x, stopped = settle_states(problem, problem.variables.start(self.plant))
+        if stopped:
+            raise holdout.StoppedError
+        return self.cut.starting_at(problem.variables.split(x).states)
+
+    @cached_property
+    def splits(self) -> list[tuple[Windows, Windows]]:
+        """Training and test windows, see `holdout_splits`."""
+        return holdout.holdout_splits(self.windows, self.options.folds)
 
     @cached_property
     def of_law(self) -> Tensor:
@@ -411,7 +427,7 @@ class Validation:
     @property
     def several(self) -> bool:
         """True if whole recordings can be held out."""
-        return len({place for place, *_ in self.windows.spans}) > 1
+        return len({place for place, *_ in self.cut.spans}) > 1
 
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The trial with the best prior; a wider plant prior is used only if clearly better."""
@@ -506,14 +522,13 @@ class Validation:
 
         Hold-out windows are shorter, and insensitive to small torque errors.
         """
-        windows = self.law.cut(self.motions, self.length)
+        windows = self.of_start
         if end.stopped or windows.spans == self.windows.spans:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
         problem = self.law.problem(windows, self.noise, law)
-        of_law, states = holdout.settled(windows, problem, law, self.plant)
-        # From smoothed states the search may miss the minimum of a long window.
-        network, _ = holdout.settled(windows, end.problem, friction, plant, states)
+        of_law = holdout.settled(windows, problem, law, self.plant)
+        network = holdout.settled(windows, end.problem, friction, plant)
         worse = 100 * (float((network.mean() / of_law.mean()).sqrt()) - 1)
         return LOST.format(windows.length, worse) if worse > 0 else ""
 
@@ -551,8 +566,7 @@ class Validation:
         if end.stopped:
             raise holdout.StoppedError
         friction, plant, *_ = end.parts
-        squares, _ = holdout.settled(test, end.problem, friction, plant)
-        return squares.clamp_min(self.explained**2)
+        return holdout.settled(test, end.problem, friction, plant).clamp_min(self.explained**2)
 
 
 def constant_kept(

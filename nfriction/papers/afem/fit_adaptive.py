@@ -337,7 +337,7 @@ class ClassFit:
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
         # Windows are compared in joint coordinates, without encoder offsets.
         corrected = replace(task, recordings=joint, motions=motions)
-        windows = cut_windows(joint, motions, length)
+        windows = constant.started(cut_windows(joint, motions, length))
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property

@@ -463,6 +463,7 @@ def fit_by_search(
         steps=result.iterations,
         motions=task.motions,
         residuals=residuals,
+        window_states=torch.cat([windows.q0, windows.qd0], 1),
     )
     if by_class is None:
         return found
