@@ -194,7 +194,7 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
 
 def test_windows_start_at_the_states_of_the_fit(constant):
     """From smoothed ones a search may end in another minimum of a long window."""
-    joint, found = constant
+    _, found = constant
     search = refinement(constant)
     windows = search.cut(found.motions, 0.5)
     law = vector(replace(search, friction=found.model))

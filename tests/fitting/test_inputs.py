@@ -105,7 +105,7 @@ def test_the_law_with_inputs_starts_where_the_law_ended() -> None:
     law = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recording, **brief)
     model = NFCVFM(2, v_smooth=V_SMOOTH)
     task = prepare_task(model, plant, [recording], FitOptions(**brief))
-    turned = tuple(replace(motion, q=motion.q + [3.0, -3.0]) for motion in task.motions)
+    turned = tuple(replace(motion, q=motion.q + np.array([3.0, -3.0])) for motion in task.motions)
     found = widened_start(replace(task, motions=turned), law, ["direction"])
     assert found.residual < law.residual
 

@@ -176,10 +176,10 @@ class Workspace:
                 ("inputs", InputGain),
             ):
                 plain[field] = tuple(kind(*row) for row in plain[field])
-            arrays = {field: torch.as_tensor(values) for field, values in self.arrays(name).items()}
+            plain |= {field: torch.as_tensor(x) for field, x in self.arrays(name).items()}
             return FitResult(
                 model=load(path), plant=load_plant(path), motions=tuple(bench.train_motions),
-                **arrays, **plain,
+                **plain,
             )  # fmt: skip
         losses: dict[str, list[float]] = {}
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
