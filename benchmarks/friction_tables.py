@@ -1,6 +1,6 @@
 """Friction laws on real tables of friction torque, beside plain least squares.
 
-Prints, for each joint, the NRMSE on contiguous blocks left out: of five models by least squares
+Prints, for each joint, the NRMSE on contiguous hold-out blocks: of five models by least squares
 (the baselines of the data cards: offset, Coulomb and viscous; with three Stribeck terms; with
 load-proportional Coulomb friction; five slip elements; all of these), of the best law without
 memory that `nfriction.fit_torque` fits, and of the law that it chooses. With `--splits`, the same
@@ -64,7 +64,7 @@ def designs(joint: JointTorque) -> dict[str, Array]:
 
 
 def left_out(joint: JointTorque, design: Array, folds: int) -> float:
-    """NRMSE of plain least squares on blocks left out."""
+    """NRMSE of plain least squares on hold-out blocks."""
     square = 0.0
     for block in blocks(joint, folds):
         rest = np.setdiff1d(np.arange(len(joint)), block)
@@ -113,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         errors = found.to_frame()
         memory = {n for n, fits in found.fits.items() if fits[0].model.law.memory is not None}
         plain = errors.drop(columns=list(memory)).min(axis=1)
-        print(f"\n{name}: NRMSE on {arguments.folds} blocks left out "
+        print(f"\n{name}: NRMSE on {arguments.folds} hold-out blocks "
               f"({time.perf_counter() - begin:.0f} s)")  # fmt: skip
         heads = (*BASELINES, "no memory", "chosen", "law")
         print(f"{'':8}" + "".join(f"{head:>10}" for head in heads))

@@ -70,7 +70,7 @@ def train(argv: Sequence[str] | None) -> str:
     qd, qdd = (x[first].numpy() for x in motion[:2])
     place_units(model.schedule, values, values, [Motion(np.arange(len(qd)) / 1000, qd, qd, qdd)])
     before = motion[3][first] - model(*(x[first] for x in motion[:3]))
-    # Neighbouring errors are correlated, so one second of samples is worth about one sample.
+    # Neighbouring errors are correlated, so 0.2 s of samples are worth about one.
     options = OnlineOptions(
         noise=float(before[1000:, 0].square().mean().sqrt()) * (0.2 / (EVERY * 1e-3)) ** 0.5,
         forgetting=given.forgetting, sample_time=EVERY * 1e-3,

@@ -1,4 +1,4 @@
-"""Train a model with coefficients by class of acceleration: the first paper's adaptive models.
+"""Train a model with coefficients by class of acceleration: the TLRIP paper's adaptive models.
 
     python trainers/train_adaptive.py run1.csv run2.csv --rig rig.json --model ALFM
     python trainers/train_adaptive.py --twin tlrip --model ANLFM --method pattern

@@ -1,10 +1,10 @@
-"""Train a model with constant coefficients on recordings of 40 s, or like the second paper.
+"""Train a model with constant coefficients on recordings, or as the RTIP paper did.
 
     python trainers/train_constant.py run1.csv run2.csv --rig rig.json --model NLFM
     python trainers/train_constant.py --twin rtip --model NCFM --method sqp
     python trainers/train_constant.py --twin rtip --model LFM --method pattern
 
-The last two repeat the second paper's estimation (80 s): NCFM by sequential quadratic programming,
+The last two repeat the RTIP paper's estimation (80 s): NCFM by sequential quadratic programming,
 LFM and NLFM by pattern search on the simulated position. After Ctrl-C or a kill, `--resume`
 continues a pattern search from its last iteration; the other methods, which take seconds to
 minutes, start again. The result is that of an uninterrupted run.
@@ -22,7 +22,9 @@ MODELS = ("NCFM", "CFM", "CVFM", "LFM", "NLFM", "Stribeck")
 def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
     parser.add_argument("--model", choices=MODELS, default="NLFM")
-    parser.add_argument("--method", choices=("trajectory", "pattern", "sqp"), default="trajectory")
+    parser.add_argument(
+        "--method", choices=("output-error", "pattern", "sqp"), default="output-error"
+    )
     parser.add_argument("--horizon", type=float, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument(
@@ -30,7 +32,7 @@ def train(argv: Sequence[str] | None) -> str:
     )
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
-    if given.method == "trajectory":
+    if given.method == "output-error":
         found = fit_from_start(workspace, bench, given.model)
     else:
         found = fit_searched(workspace, bench, given.model, given.method, given.horizon)

@@ -1,4 +1,4 @@
-"""Train a neuro-fuzzy model by our method or by the first paper's own procedure.
+"""Train a neuro-fuzzy model by our method or by the TLRIP paper's own procedure.
 
     python trainers/train_neurofuzzy.py run1.csv run2.csv --rig rig.json --model NFLFM
     python trainers/train_neurofuzzy.py --twin tlrip --model NFNLFM --procedure papers

@@ -1,4 +1,4 @@
-"""Train the first paper's networks on the outputs of fuzzy controllers along a measured motion.
+"""Train the TLRIP paper's networks on the outputs of fuzzy controllers along a measured motion.
 
     python trainers/train_supervised.py
     python trainers/train_supervised.py --adaptive runs/papers/models/ANLFM.json --units 12

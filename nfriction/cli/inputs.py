@@ -171,15 +171,15 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Options of `fit` and `compare`."""
     add = parser.add_argument
     add("--rig", required=True, type=rig,
-        help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's .xml), or one of "
-        f"{', '.join(RIGS)}")  # fmt: skip
+        help="a rig file (.json, .toml), a robot description (.urdf; MuJoCo's .xml or .mjcf), or "
+        f"one of {', '.join(RIGS)}")  # fmt: skip
     add_reading_options(parser)
     add("--windows", type=positives, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
         )  # fmt: skip
     add("--fit-plant", action=argparse.BooleanOptionalAction, default=True,
-        help="adjust the rig's inertia and gravity terms within bounds (default: yes)"
-        )  # fmt: skip
+        help="adjust the rig within bounds: inertia, gravity, lengths, encoder zeros, gear losses, "
+        "torque constants and offsets, air drag (default: yes)")  # fmt: skip
     add("--drag", action=argparse.BooleanOptionalAction,
         help="fit air drag on the links (default: if nothing drives the rig)")  # fmt: skip
     add("--eccentricity", choices=CHOICES["eccentricity"], default="off",
@@ -187,8 +187,8 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         )  # fmt: skip
     add("--encoder-reference", choices=CHOICES["encoder_reference"], default="auto",
         help="when incremental encoders were set to zero: before all recordings (shared), or at "
-        "the start of each in a pose held by stiction (default: per_recording if all recordings "
-        "of a driven rig begin at rest at zero)")  # fmt: skip
+        "the start of each in a pose held by stiction (per_recording); auto: per_recording if "
+        "several recordings of a driven chain begin at rest at zero (default: auto)")  # fmt: skip
     add("--max-steps", type=count, default=30, metavar="N",
         help="limit of search steps at each window length (default: 30)")  # fmt: skip
     add("--loss", choices=CHOICES["loss"], default="linear",

@@ -13,7 +13,7 @@ from nfriction.friction.models import FrictionModel
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
     "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
-    f"preceding {LEAD_IN:g} s, which are\nnot scored, or from a given one; error reduction: of the "
+    f"{LEAD_IN:g} s before it,\nor from a given one; error reduction: of the "
     "free run, relative to no friction on the rig\nas given; limit of these data: largest error of "
     f"{DRAWS} simulations with noise in start and torque, plus the\nerror of the integration; "
     "=: differs from the smallest error by less than that limit"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Commands, Progress, UsageError, check_writable, one_line, warn
-from nfriction.friction import plain_name
+from nfriction.friction import model_list, plain_name
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,15 +24,15 @@ def add_fit(commands: Commands) -> None:
         "fit-torque", run_fit, "fit models to friction torque over velocity",
         description="Fit friction models to a table of friction torque over velocity, from "
         "constant-velocity tests or the residuals of inverse dynamics, and compare them on "
-        "blocks left out.",
+        "hold-out blocks.",
         example="nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck "
         "--out runs/joint",
     )  # fmt: skip
     add = parser.add_argument
     add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
     add("--models", type=inputs.models,
-        help=f"comma-separated: {inputs.MODELS} (default: all constant laws that the columns allow)"
-        )  # fmt: skip
+        help=f"comma-separated: {model_list(of_tables=True)} (default: all constant laws that the "
+        "columns allow)")  # fmt: skip
     add("--out", type=Path, default=Path("runs/torque"), help="folder to write")
     add("--folds", type=inputs.count, default=10, metavar="N",
         help="blocks that are left out in turn")  # fmt: skip

@@ -275,9 +275,9 @@ class Comparison:
                 excused.append(str(name))
             # Where all of these diverge, none is known to be better.
             elif np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
-                best = f"{smaller.idxmin()} with no more parameters has {1e3 * least:.3g}"
-                own = f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges"
-                found[str(name)] = f"{best} m{self.unit}, {own}"
+                best = f"{smaller.idxmin()}, with no more parameters, errs by {1e3 * least:.3g}"
+                own = f"by {1e3 * error:.3g} m{self.unit}" if np.isfinite(error) else "diverges"
+                found[str(name)] = f"{best} m{self.unit}, this model {own}"
             elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
                 found[str(name)] = "no friction predicts better"
         for name in rmse.index[rmse >= rmse[[*found]].min()].drop(excused, errors="ignore"):
@@ -312,7 +312,11 @@ class Comparison:
         scored = [s for part in self.parts for s in self.scores(part)[best]]
         scores = [score for score in scored if score.recording == recording.name]
         if found is None or not scores:
-            raise ValueError(f"nothing was simulated on {recording.name!r}, or nothing was fitted.")
+            raise ValueError(
+                f"{recording.name!r} was not scored; give one of the compared recordings."
+                if found
+                else "no model was fitted, so there is nothing to animate."
+            )
         plant, motions = found.plant, {"measured": recording.q, best: scores[0].simulated}
         if plant.unit == "rad":
             to_joint = recording.resolve_convention(plant).position_to_joint
@@ -396,7 +400,10 @@ def compare(
     train = Recording.many(train, plant=plant, name="train")
     test = Recording.many(test, plant=plant, name="test")
     if not models or not train:
-        raise ValueError("at least one model and one training recording are needed.")
+        raise ValueError(
+            "compare needs at least one model and one training recording, got "
+            f"{len(models)} and {len(train)}."
+        )
     check_recordings(train, test)
     for name in models:
         require_drive(as_model(name, plant.joints).law, [*train, *test])

@@ -243,12 +243,12 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):
         simplest = min(candidates, key=lambda c: c.parameters)
-        return simplest.name, "every model diverged on a block left out; the simplest is chosen."
+        return simplest.name, "every model diverged on a hold-out block; the simplest is chosen."
     tied = [c for c in candidates if indistinguishable(c, best)]
     chosen = min(tied, key=lambda c: (c.parameters, c.error))
     if chosen is not best:
         return chosen.name, (
-            f"its error on blocks left out, {error(chosen)}, is statistically tied with the "
+            f"its error on hold-out blocks, {error(chosen)}, is statistically tied with the "
             f"smallest, {error(best)} of {best.name}, and it has fewer parameters "
             f"({chosen.parameters} against {best.parameters})."
         )
@@ -256,9 +256,9 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     if not others:
         return best.name, "it is the only model."
     if math.isinf(others[0].error):
-        return best.name, "every other model diverged on a block left out."
+        return best.name, "every other model diverged on a hold-out block."
     return best.name, (
-        f"its error on blocks left out, {error(best)}, is the smallest; {others[0].name} follows "
+        f"its error on hold-out blocks, {error(best)}, is the smallest; {others[0].name} follows "
         f"with {error(others[0])}."
     )
 

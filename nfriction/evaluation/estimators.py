@@ -88,7 +88,8 @@ class FrictionEstimator(BaseEstimator):
         self.horizon = horizon
         unknown = set(fit_settings) - set(SETTINGS)
         if unknown:
-            raise TypeError(f"`fit` has no setting {', '.join(sorted(unknown))}.")
+            there, asked = ", ".join(SETTINGS), ", ".join(sorted(unknown))
+            raise TypeError(f"`fit` has no setting {asked}; there are {there}.")
         for name, parameter in SETTINGS.items():
             setattr(self, name, fit_settings.get(name, parameter.default))
 

@@ -119,7 +119,8 @@ class Simulator:
             require_model(friction)
             if friction.joints != plant.joints:
                 raise ValueError(
-                    f"the plant has {plant.joints} joints, the friction model {friction.joints}."
+                    f"the plant has {plant.joints} joints, the friction model {friction.joints}; "
+                    f"make the model with joints={plant.joints}."
                 )
             require_drive(friction.law, [recording])
         self.plant, self.friction, self.recording = plant, friction, recording

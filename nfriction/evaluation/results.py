@@ -7,7 +7,7 @@ import logging
 import re
 import shutil
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from nfriction.export import ExportError, torchscript
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.io.files import checked_json, write_atomically
 from nfriction.io.model_file import ModelInfo, parameter_hash, save
-from nfriction.recording import Recording
+from nfriction.recording import Recording, RecordingLike
 
 logger = logging.getLogger(__name__)
 
@@ -48,16 +48,17 @@ def digests(recordings: Sequence[Recording]) -> dict[str, str]:
 
 
 def model_info(
-    fit: FitResult, recordings: Recording | Sequence[Recording], run: str = ""
+    fit: FitResult, recordings: RecordingLike | Iterable[RecordingLike], run: str = ""
 ) -> ModelInfo:
     """Description of a fit for `save` and exports: rig, ranges of the training data, rating.
 
     Args:
         fit: the result; ranges are those of its smoothed motions [rad/s, rad/s²; m/s, m/s²].
-        recordings: to which it was fitted; their digests and sample time [s] are included.
+        recordings: to which it was fitted, or their paths; their digests and sample time [s] are
+            included.
         run: id of the run that made it.
     """
-    recordings = [recordings] if isinstance(recordings, Recording) else recordings
+    recordings = Recording.many(recordings, plant=fit.plant, name="recordings")
     qd = np.concatenate([m.qd for m in fit.motions])
     qdd = np.concatenate([m.qdd for m in fit.motions])
     times = sorted(r.sample_time for r in recordings)

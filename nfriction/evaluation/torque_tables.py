@@ -1,4 +1,4 @@
-"""Friction laws on tables of friction torque: fits, comparison by blocks left out, prediction."""
+"""Friction laws on tables of friction torque: fits, comparison by hold-out blocks, prediction."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class TorqueFits:
 
     Attributes:
         fits: by name of the model, one per joint in the table's order.
-        candidates: errors on blocks left out, by joint: root mean square torque [N m; N].
+        candidates: errors on hold-out blocks, by joint: root mean square torque [N m; N].
         choices: model to use and the reason, by joint.
         failed: models that could not be fitted, with the reason.
     """
@@ -179,7 +179,7 @@ class TorqueFits:
         return score_models(self._models(model), as_table(table, unit=self.table.unit))
 
     def to_frame(self) -> pd.DataFrame:
-        """NRMSE on blocks left out by joint and model."""
+        """NRMSE on hold-out blocks by joint and model."""
         import pandas as pd  # slow to import
 
         spread = {joint.name: float(joint.tau.std()) for joint in self.table.joints}
@@ -226,12 +226,12 @@ class TorqueFits:
         for joint, (name, why) in self.choices.items():
             error = float(self.to_frame()[name][joint])
             lines.append(
-                f"{joint}: {plain_name(name)}, NRMSE {error:.3f} on blocks left out; {why}"
+                f"{joint}: {plain_name(name)}, NRMSE {error:.3f} on hold-out blocks; {why}"
             )
         return "\n".join(lines)
 
     def summary(self) -> str:
-        """Choice, errors on blocks left out, coefficients with 95 % intervals, and remarks."""
+        """Choice, errors on hold-out blocks, coefficients with 95 % intervals, and remarks."""
         frames = (self.to_frame(), self.intervals())
         tables = [f.to_string(float_format=lambda x: f"{x:.4g}", na_rep="") for f in frames]
         return "\n\n".join([self._head(), *tables, *self.table.remarks])
@@ -250,7 +250,7 @@ class TorqueFits:
         return figure
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON: choices, errors on blocks left out, coefficients and intervals."""
+        """Plain JSON: choices, errors on hold-out blocks, coefficients and intervals."""
         return {
             "kind": "torque table",
             "unit": self.table.unit,
@@ -544,7 +544,7 @@ def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
 def _fit(
     name: str, joint: JointTorque, v_smooth: float, folds: int, options: FitOptions
 ) -> tuple[torque_table.JointFit, Candidate]:
-    """A model fitted to all rows of a joint, and its errors on blocks left out."""
+    """A model fitted to all rows of a joint, and its errors on hold-out blocks."""
     model = model_by_name(name)(1)
     form = model.schedule.form
     # With fewer rows than folds, each row is left out once.

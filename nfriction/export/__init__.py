@@ -1,4 +1,4 @@
-"""Artefacts for controllers, each proven equal to the model that was scored."""
+"""Artefacts for controllers, each checked against the model that was scored."""
 
 from nfriction.export.c_file import c
 from nfriction.export.contract import (

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_buffers, adjusted_plant
-from nfriction.fitting.data.inputs import weighs
+from nfriction.fitting.data.inputs import names_of, weighs
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.result.paired_test import gains, student_quantile
+from nfriction.fitting.result.paired_test import gains, jackknife_sd, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
@@ -85,6 +85,11 @@ class _Data:
     def needed(self, plant: Plant) -> Tensor:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
+
+    @cached_property
+    def driven(self) -> list[int]:
+        """Joints with a torque."""
+        return np.flatnonzero(self.tau.any(0)).tolist()
 
     @cached_property
     def moving(self) -> Tensor:
@@ -182,8 +187,8 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
         return ()
     causes = ", or ".join(mistake.text for mistake in mistakes)
     left = (
-        f" With the correction friction leaves {mistakes[0].unexplained:.2g} of the torque "
-        f"unexplained, without it {stated:.2g}."
+        f" Friction leaves {stated:.2g} of the torque unexplained, after the correction "
+        f"{mistakes[0].unexplained:.2g}."
     )
     known = not math.isnan(mistakes[0].unexplained)
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
@@ -314,7 +319,7 @@ def _odd_one_out(
     pairs = zip(recordings, motions, strict=True)
     alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
     odd = int(np.argmax(np.nan_to_num(alone, nan=-1.0)))
-    name = recordings[odd].name or f"recording {odd + 1}"
+    name = names_of(recordings)[odd]
     order = sorted(range(len(alone)), key=lambda k: k != odd)
     recordings, motions = [recordings[k] for k in order], [motions[k] for k in order]
     share = _unexplained(plant, _collect(recordings[1:], motions[1:], options))
@@ -333,9 +338,9 @@ def _torques_of_terms(
     plant: Plant, data: _Data, options: FitOptions
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Torque per unit of each encoder zero, and of each term of inertia and gravity."""
-    driven, needed = np.flatnonzero(data.tau.abs().amax(0)).tolist(), data.needed(plant)
+    needed = data.needed(plant)
     found: tuple[list[Tensor], list[Tensor]] = ([], [])
-    for term in plant_parameters(plant, driven=driven, options=options):
+    for term in plant_parameters(plant, driven=data.driven, options=options):
         if term.ratio or term.name.startswith("angle offset"):
             changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
             found[term.ratio].append((data.needed(plant.replace(**changed)) - needed) / 1e-3)
@@ -368,14 +373,14 @@ def _unlike_zeros(
         least = torch.linalg.lstsq(terms, known, rcond=1e-9, driver="gelsd")
         found.append((least.solution[:, 0] / scale)[: len(own)].reshape(len(zeros), -1))
     sure, said = student_quantile(pieces - 1, 1 - options.drift_chance / 2), []
-    names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
+    names = names_of(recordings)
     if len({*names}) < len(names):
         names = [f"recording {k + 1}" for k in range(len(names))]
     for j, seen in enumerate(shown):
         places = seen.nonzero().flatten()
         order = places[found[0][j, places].argsort()].tolist()
         change, *others = (float(x[j, order[-1]] - x[j, order[0]]) if order else 0.0 for x in found)
-        if change - sure * math.sqrt((pieces - 1) * np.var(others)) > options.angle_term[1]:
+        if change - sure * jackknife_sd(others) > options.angle_term[1]:
             joint = plant.joint_names[plant.joints - len(zeros) + j]
             pair = " and ".join(names[k] for k in sorted({order[0], order[-1]}))
             said.append(f"{joint} by {math.degrees(change):.2g} degrees between {pair}")
@@ -558,8 +563,7 @@ def _scaled_terms(
 ) -> Iterator[tuple[PlantParameter, float, Plant]]:
     """Each term of inertia and gravity, the relative change that explains most, and its rig."""
     own = dict(plant.named_buffers())
-    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
-    for term in plant_parameters(plant, driven=driven, options=options):
+    for term in plant_parameters(plant, driven=given.driven, options=options):
         if term.ratio and term.name.startswith(("inertia", "gravity", "mass")):
             x = _amount(plant, {k: own[k] * part for k, part in term.change.items()}, given)
             if x > -1:
@@ -570,7 +574,7 @@ def _corrected_torques(
     plant: Plant, given: _Data, options: FitOptions
 ) -> Iterator[tuple[str, _Data]]:
     kind = "force" if plant.unit == "m" else "torque"
-    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    driven = given.driven
     groups = [(f"the {kind} of {plant.joint_names[j]}", [j]) for j in driven]
     if len(driven) > 1:
         groups.append((f"every {kind}", driven))
@@ -601,7 +605,7 @@ def _corrected_torques(
 
 def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
     """Each drive with the torque limit that explains most."""
-    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+    for j in given.driven:
         largest = float(given.tau[:, j].abs().max())
 
         def limited(limit: float, joint: int = j) -> _Data:
@@ -624,7 +628,7 @@ def _switched_off(
     """Each drive, and all together, switched off during the piece where that explains most."""
     needed, driven = given.mean(given.needed(plant)), given.mean(given.tau)
     number, time = given.mean(given.number.to(given.q))[:, 0], given.mean(given.time)[:, 0]
-    gained, joints = torch.zeros_like(needed), np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    gained, joints = torch.zeros_like(needed), given.driven
     for j in joints:
         shapes, left = given.friction[:, j], given.moving[:, j] * (driven - needed)[:, j]
         left = left - shapes @ (torch.linalg.pinv(shapes) @ left)
@@ -634,14 +638,14 @@ def _switched_off(
     groups += [("all drives are", joints)] * (len(joints) > 1)
     for what, own in groups:
         found = []
-        for k, recording in enumerate(recordings):
+        for k, name in enumerate(names_of(recordings)):
             blocks = (number == k).nonzero().flatten()
             # The consecutive blocks with the largest sum.
             total = np.append(0.0, gained[blocks][:, own].sum(1).cumsum(0).numpy())
             rise = total - np.minimum.accumulate(total)
             end = int(rise.argmax())
             piece = blocks[int(total[: end + 1].argmin()) : end]
-            found.append((float(rise[end]), piece, recording.name or f"recording {k + 1}"))
+            found.append((float(rise[end]), piece, name))
         most = max(gain for gain, *_ in found)
         tau, said = given.tau.reshape(-1, given.block, plant.joints).clone(), []
         for gain, piece, name in found:
@@ -665,8 +669,8 @@ def _end_stops(
     needed, rest = given.needed(plant), torch.zeros_like(given.q)
     torque = given.mean(given.tau - needed)
     inertial = given.mean(needed - plant.inverse_dynamics(given.q, rest, rest)).abs()
-    names = [recording.name or f"recording {k + 1}" for k, recording in enumerate(recordings)]
-    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+    names = names_of(recordings)
+    for j in given.driven:
         q, said = given.q[:, j].reshape(-1, given.block), []
         for side, end in ((-1, q.min()), (1, q.max())):
             away = (end - q).abs().amax(1) / (q.max() - q.min())
@@ -704,7 +708,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
     blocks = needed.reshape(-1, given.block, plant.joints)
     curvature = 2 * torch.einsum("bsj,s->bj", blocks, parabola) / parabola.square().sum()
     curvature = curvature.repeat_interleave(given.block, 0)
-    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+    for j in given.driven:
         part = torch.where(torch.arange(plant.joints) == j, curvature, 0.0)
         ratio = -_balance(given, given.tau - needed, part)[1]
         if ratio > 0:
@@ -744,7 +748,7 @@ def changing_friction(
             alone = [(number == k).to(number) for k in range(len(recordings))]
             own = [_growth(piece < 0, friction, of_rig, torque, x[sliding])[0] for x in alone]
             odd = int(np.argmax(np.abs(own)))
-            name = recordings[odd].name or f"recording {odd + 1}"
+            name = names_of(recordings)[odd]
             between.append((f"in {name} relative to the others", alone[odd]))
         for clocks in (during, between):
             tried = []
@@ -777,15 +781,15 @@ def changing_friction(
                 change, reach = (float(f"{100 * x:.2g}") for x in (abs(ratio - 1), sd))
                 yield (
                     f"The friction of {plant.joint_names[j]} {'grows' if rate > 0 else 'falls'} by "
-                    f"{change:g} % (within {reach:g} %) {period} (warm-up, payload); the intervals "
-                    "do not cover this."
+                    f"{change:g} ± {reach:g} % {period} (warm-up, payload); the intervals do not "
+                    "cover this."
                 )
 
 
 def loose_loads(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[str]:
-    """A sentence for each driven joint whose load is loose after it reverses: play in a gear.
+    """A sentence for each driven joint whose gear has play: its load is loose after it reverses.
 
     For the arguments see `likely_mistakes`. Within the play a drive accelerates only its rotor, so
     the torque of the load is missing after it reversed, but not before; a wrong rig, law or delay
@@ -797,7 +801,7 @@ def loose_loads(
     # Every block, because a reversal lies between adjacent blocks.
     every = replace(options, diagnosis_samples=sum(map(len, recordings)))
     data = _collect(recordings, motions, every)
-    driven = np.flatnonzero(data.tau.any(0)).tolist()
+    driven = data.driven
     geared = [k for k in driven if "armature" in own and own["armature"][k] > 0]
     if not geared or len(data.q) < 2 * pieces * data.block:
         return
@@ -825,13 +829,14 @@ def loose_loads(
                 (known / scale)[seen], torque[seen], rcond=1e-9, driver="gelsd"
             )
             found.append(-float(least.solution[-1] / scale[-1]))
-        share, sd = found[0], math.sqrt((pieces - 1) * np.var(found[1:]))
+        share, sd = found[0], jackknife_sd(found[1:])
         sure, within = (student_quantile(pieces - 1, 1 - x) for x in (options.drift_chance, 0.025))
         if share > max(sd * sure, 0.5 + sd * within):
             yield (
-                f"The load of {plant.joint_names[j]} is loose after it reverses: {100 * share:.0f} "
-                f"% (within {100 * sd * within:.0f} %) of its torque is missing for about "
-                f"{options.diagnosis_block:g} s (play in a gear); the intervals do not cover this."
+                f"The gear of {plant.joint_names[j]} has play: for about "
+                f"{options.diagnosis_block:g} s after the load reverses, {100 * share:.0f} ± "
+                f"{100 * sd * within:.0f} % of its torque is missing; the intervals do not cover "
+                "this."
             )
 
 
@@ -866,7 +871,7 @@ def _growth(
     """Growth of friction per unit of time, relative to its mean [-].
 
     From the terms of friction and of the rig, (block, term) each, that explain the torque. Also
-    returns the sums of squared torque errors of constant and growing friction on blocks left out.
+    returns the sums of squared torque errors of constant and growing friction on hold-out blocks.
     """
     known, seen = torch.cat([friction, of_rig], 1), ~left_out
     constant = torch.linalg.lstsq(known[seen], torque[seen], driver="gelsd").solution
@@ -880,7 +885,7 @@ def _growth(
 def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     """Each driven joint with a spring to the frame, whose rest is anywhere."""
     needed = given.needed(plant)
-    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+    for j in given.driven:
         part = torch.where(torch.arange(plant.joints) == j, given.q, 0.0)
         stiffness = -_balance(given, given.tau - needed, part)[1]
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
@@ -905,7 +910,7 @@ def _unbalanced(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
 def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     """Each driven joint with a torque that repeats with its position, as of a motor's magnets."""
     left, terms, weight = _equations(given, given.tau - given.needed(plant))
-    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist() if plant.unit == "rad" else ():
+    for j in given.driven if plant.unit == "rad" else ():
         q, known = given.q[:, j], terms[:, j]
         span = float(q.max() - q.min())
         # At least two periods within the motion.

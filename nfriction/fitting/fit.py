@@ -4,11 +4,11 @@ A fit has two stages. *Equation error*: the smoothed motion implies the friction
 
     tau_f = tau - M(q) qdd - bias(q, qd),
 
-in which constant coefficients are linear, so regression finds them from any start, but biased by
-the noise of qdd. *Output error*: simulations from the start of short windows must follow the
+which is linear in most coefficients, so regression finds them from any start, but biased by the
+noise of qdd. *Output error*: simulations from the start of short windows must follow the
 measured positions; this refines coefficients and plant without any derivative of the data. A
-strategy, one for each kind of coefficients (`fitting.strategy`), determines the order of the
-stages, their starting points and their windows. The next step is
+strategy, one for each kind of coefficients (`fitting.strategy`), determines starting points and
+windows: for constant ones of 0.5, 2 and 5 s, each from the end of the previous. The next step is
 `nfriction.fitting.shooting.problem`, the cost of the second stage.
 """
 
@@ -51,14 +51,15 @@ def fit(
     skipped, with a warning. Laws with several minima are also started from their grid of initial
     values and from the simpler law that they contain (`Law.nested_law`); the lowest residual wins.
     A neuro-fuzzy model starts at the constant fit of its law and is kept only if it improves the
-    error on hold-out windows, each held out in turn, by more than scatter explains; its plant prior
-    is relaxed, its sets move and it gets further inputs (`FitResult.inputs`: the direction of
-    rotation, the load of the bearings) only for such a gain. An adaptive model also starts at the
+    error on hold-out windows, each held out in turn, by a factor of 1.1 and more than the scatter;
+    a wider plant prior, moved sets and further inputs (`FitResult.inputs`: the direction of
+    rotation, the load of the bearings) must improve it, too. An adaptive model also starts at the
     constant fit; `fit_adaptive` has more settings.
 
     Args:
         model: the model to fit, changed in place; or its name, such as "coulomb-viscous", with
-            v_smooth 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
+            v_smooth at most 1/1000 of the slowest joint's largest velocity and 3 mrad/s or mm/s;
+            less for a rig that is driven or comes to rest.
         plant: the mechanism as given, its name, or the path of a rig file.
         recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
             convention, by default the plant's.
@@ -105,11 +106,15 @@ def fit(
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
     schedule = task.model.schedule
     if not schedule.fit_strategy:
-        raise ValueError(f"cannot fit coefficients of type {type(schedule).__name__}.")
+        raise ValueError(
+            f"coefficients of type {type(schedule).__name__} have no fit strategy; set the class "
+            'attribute `fit_strategy` to "module:function", see `Schedule`.'
+        )
     if method == "equation_error" and schedule.follows_motion:
         raise ValueError('adaptive and neuro-fuzzy models need `method="output_error"`.')
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     found = strategy(task)
-    unmodelled = task.play if has_input(found.model.law, "heat") else (*task.drift, *task.play)
-    return found.with_warnings(task.data_warnings, task.mistakes, unmodelled)
+    found = found.with_warnings(task.data_warnings, task.mistakes, (*task.drift, *task.play))
+    # A law with heat explains friction that changes with time.
+    return found.without(task.drift) if has_input(found.model.law, "heat") else found

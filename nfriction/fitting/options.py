@@ -1,4 +1,4 @@
-"""Options of a fit: the user's choices, and every constant that affects its result."""
+"""Options of a fit: the user's choices, and the tuning constants of its stages."""
 
 import math
 from collections.abc import Sequence
@@ -152,10 +152,12 @@ class FitOptions:
     # Residuals below this multiple of the encoder's rounding leave no room for a better minimum.
     explained_ratio: float = 1.1
     # Search for the states of windows at given parameters: few unknowns with a close start.
-    settling_steps: int = 6
+    settling_steps: int = 30
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
+    # The law's error over that of a network has to be this: less could be measurement noise.
+    network_gain: float = 1.1
     # Every `folds`-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
     # Chance that scatter counts as a gain on hold-out windows: one standard error, because priors
@@ -229,6 +231,11 @@ class FitOptions:
         if not isinstance(self.max_steps, Integral) or self.max_steps < 0:
             raise ValueError(
                 f"`max_steps` must be a whole number of at least 0, got {self.max_steps!r}."
+            )
+        if not self.fit_plant and (self.drag or self.eccentricity == "on"):
+            raise ValueError(
+                '`drag=True` and `eccentricity="on"` fit terms of the plant, so they need '
+                "`fit_plant=True`, got False."
             )
         if self.method == "equation_error":
             if self.encoder_reference == "per_recording":

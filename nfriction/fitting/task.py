@@ -16,6 +16,7 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.inputs import has_input
+from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import PendulumChain, Plant, rigs
@@ -150,6 +151,14 @@ def known_terms(
     if start is not None:
         known |= {name: value for name, value, _ in start.plant_terms}
     return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+
+
+def terms_after(task: FitTask, at: FitResult, law: Law, plant: Plant) -> list[PlantParameter]:
+    """Terms of a plant that a search adjusts further after a fit, see `adjustable_terms`."""
+    return inputs.adjustable_terms(
+        plant, law, task.recordings, task.options,
+        eccentric=fits_eccentricity(task.options, at), per_recording=bool(at.encoder_offsets),
+    )  # fmt: skip
 
 
 def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:

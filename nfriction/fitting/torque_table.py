@@ -169,7 +169,7 @@ def fit_network(
 def fit_memory(
     name: str, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
 ) -> tuple[JointFit, tuple[float, ...]]:
-    """Coefficients of a named model with memory, and its errors on blocks left out [N m; N].
+    """Coefficients of a named model with memory, and its errors on hold-out blocks [N m; N].
 
     Raises:
         ValueError: if the rows have no time, their position does not change, or the law needs a

@@ -125,16 +125,19 @@ def model_name(text: str) -> str:
     return _BY_TEXT[asked]
 
 
-def model_list() -> str:
-    """All models in a phrase: the laws by both names, and what may precede them."""
-    plain, *others = _KINDS
+def model_list(*, of_tables: bool = False) -> str:
+    """Models for recordings, or for tables of torque: laws by both names, and their prefixes."""
+    plain, adaptive, network = _KINDS
     laws = ", ".join(both_names(plain.letters + short) for short in _LAWS.values())
-    first = next(iter(_LAWS.values()))
-    before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
+    first, bristles = next(iter(_LAWS.values())), ", ".join(_BRISTLES)
+    kinds = (network,) if of_tables else (adaptive, network)
+    before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in kinds)
+    besides = "" if of_tables else f", except {''.join(_MISSING)}"
+    memory = f"{bristles}, gear, " + ("slip, load-slip" if of_tables else "maxwell-slip")
+    also = f"{bristles} and slip" if of_tables else bristles
     return (
-        f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
-        f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}; neuro-fuzzy: may precede "
-        f"{', '.join(_BRISTLES)} and slip, too"
+        f"{laws}; also with {before} before them{besides}; with memory {memory}; neuro-fuzzy: may "
+        f"precede {also}, too"
     )
 
 

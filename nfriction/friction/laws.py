@@ -150,7 +150,7 @@ class Law:
             )
         if not self.names or len(set(self.names)) < len(self.names):
             raise ValueError(
-                f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
+                f"law {self.name!r} needs coefficients, each with its own name, got {self.names}."
             )
         if not isinstance(self.nested_law, Law | None):
             raise TypeError(f"`nested_law` must be a Law, got {self.nested_law!r}.")
@@ -165,7 +165,7 @@ class Law:
             if own[name].positive and not other.positive:
                 raise ValueError(
                     f"{name!r} of law {self.name!r} is positive, {other.name!r} of the nested law "
-                    "may be negative; let both be the same."
+                    "may be negative; give both the same `positive`."
                 )
 
     def __deepcopy__(self, memo: object) -> "Law":
@@ -200,7 +200,7 @@ def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:
 
 
 def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Viscous friction `C_p qd` (NCFM; TLRIP paper, viscous model; second paper, Table I)."""
+    """Viscous friction `C_p qd` (NCFM; TLRIP paper, viscous model; RTIP paper, Table I)."""
     return coefficients.select(-1, 0) * qd
 
 
@@ -225,7 +225,7 @@ def linear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> T
 
 
 def nonlinear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Offset, Coulomb, viscous and arctangent friction (NLFM; second paper, Table III).
+    """Offset, Coulomb, viscous and arctangent friction (NLFM; RTIP paper, Table III).
 
     `f_o + f_c sgn(qd) + f_v qd + f_a arctan(f_b qd)`; passive where `f_o = 0`.
     """

@@ -184,7 +184,7 @@ class ConstantModel(NamedModel):
 
 
 class NCFM(ConstantModel):
-    """Viscous friction `C_p qd`, one constant per joint (second paper, Table I)."""
+    """Viscous friction `C_p qd`, one constant per joint (RTIP paper, Table I)."""
 
     definition = laws.VISCOUS
 
@@ -196,7 +196,7 @@ class LFM(ConstantModel):
 
 
 class CFM(ConstantModel):
-    """Coulomb friction F_c alone: of ball bearings, where only air drag grows with velocity."""
+    """Coulomb friction F_c alone: as of dry or lightly lubricated bearings."""
 
     definition = laws.COULOMB
 
@@ -208,7 +208,7 @@ class CVFM(ConstantModel):
 
 
 class NLFM(ConstantModel):
-    """Five constants f_o, f_c, f_v, f_a, f_b per joint (second paper, Table III)."""
+    """Five constants f_o, f_c, f_v, f_a, f_b per joint (RTIP paper, Table III)."""
 
     definition = laws.NONLINEAR
 

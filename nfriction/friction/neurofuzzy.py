@@ -536,6 +536,6 @@ class NFNLFM(NeuroFuzzyModel):
 
 
 class NFStribeck(NeuroFuzzyModel):
-    """Generalised Stribeck friction with neuro-fuzzy F_c, F_d, F_v, v_s and delta."""
+    """Generalised Stribeck friction with neuro-fuzzy F_c, F_d, F_v and v_s, and constant delta."""
 
     definition = laws.STRIBECK

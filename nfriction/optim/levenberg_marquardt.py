@@ -6,7 +6,7 @@ Gauss-Newton Hessian H = J^T J. One iteration
 1. minimises g^T p + 1/2 p^T (H + damping D) p within the bounds, with D the largest diagonal of H
    so far: strong damping keeps the step p short;
 2. evaluates the cost at x + p, and accepts the step only if the cost falls;
-3. lowers the damping if the quadratic predicted the decrease well, and raises it otherwise.
+3. lowers the damping if the decrease exceeds 3/4 of the predicted one, and raises it below 1/4.
 
 The solver needs cost, gradient and Hessian, but not the Jacobian of the residuals, so callers can
 sum over 40,000 samples in chunks without storing it. The next step is `nfriction.evaluation.score`.

@@ -162,7 +162,8 @@ class Plant(nn.Module, ABC):
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Quantity other than speed on which the friction of each joint depends [-].
 
-        The normal load over that at rest; with `load_waves` k, (1 + cos(k q + p)) / 2 instead.
+        The normal force over the weight that the joint carries; with `load_waves` k,
+        (1 + cos(k q + p)) / 2 instead.
         """
         self._check(q=q, qd=qd)
         if self.has_position_load:
@@ -171,7 +172,7 @@ class Plant(nn.Module, ABC):
 
     @abstractmethod
     def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Normal load of each joint over its load at rest [-]."""
+        """Normal force in each joint over the weight that it carries [-], of its link or of all."""
 
     @abstractmethod
     def decay_rate(self, damping: Tensor) -> Tensor:

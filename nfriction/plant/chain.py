@@ -303,7 +303,7 @@ class PendulumChain(Plant):
         return kinetic, dynamics.dot(self.gravity_moment.unbind(-1), height)
 
     def normal_load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Normal load of each joint over its load at rest [-].
+        """Normal force in each joint over the weight that it carries [-].
 
         For links |N_i| / (m_i g), N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate
         qd_i and the link's absolute angle phi_i from upright; 1 for the arm, whose axis is

@@ -85,10 +85,10 @@ def tlrip(
 
 
 def rtip(arm: Literal["fixed", "free"] = "fixed", inertia: InertiaCase = "izz") -> PendulumChain:
-    """Rotary triple inverted pendulum of the second paper.
+    """Rotary triple inverted pendulum of the RTIP paper.
 
     That paper prints no masses or lengths and describes the same pendulum, so the numbers are
-    assumed to be those in Table 2 of the first paper. In contrast, angles are measured from
+    assumed to be those in Table 2 of the TLRIP paper. In contrast, angles are measured from
     hanging.
 
     References:

@@ -243,7 +243,7 @@ def _models(
             continue
         # A copied file would show the coefficients of one model under the name of another.
         if type(model).__name__ != name or model.joints != joints:
-            notes.append(f"{name}: {path} holds another model")
+            notes.append(f"{name}: {path} contains another model")
             continue
         found[name] = (model, info)
     return found, notes

@@ -19,13 +19,13 @@ FIGURE = "friction"
 
 
 def error_table(fits: TorqueFits) -> Table:
-    """NRMSE on blocks left out, by joint and model."""
+    """NRMSE on hold-out blocks, by joint and model."""
     frame = fits.to_frame()
     heads = tuple(plain_name(str(name)) for name in frame)
     rows: tuple[tuple[Value, ...], ...] = tuple(
         (str(joint), *map(float, of)) for joint, of in frame.iterrows()
     )
-    return Table("NRMSE on blocks left out", ("joint", *heads), rows, "diverged")
+    return Table("NRMSE on hold-out blocks", ("joint", *heads), rows, "diverged")
 
 
 def choice_table(fits: TorqueFits) -> Table:

@@ -156,7 +156,7 @@ def test_the_choice_on_training_data_is_told_with_its_reason(
     chosen, reason = told.split("\n")[0].split(": ")
     assert chosen in ("NCFM", "LFM")
     assert results(bench / "chosen")["selection"]["chosen"] == chosen
-    assert "error on blocks left out" in reason
+    assert "error on hold-out blocks" in reason
     # 0.4 s were left out each time, the first half of which is the lead-in.
     assert re.search(r"0\.2\d* s simulations", told)
     for name in ("NCFM", "LFM"):

@@ -28,7 +28,7 @@ def test_a_table_is_fitted_scored_and_exported(
     words = ["--columns", "qd=speed", "--models", "viscous,coulomb-viscous"]
     assert main(["fit-torque", str(csv), *words, "--out", str(out), "--no-figures"]) == 0
     printed = capsys.readouterr().out
-    assert "NRMSE on blocks left out" in printed
+    assert "NRMSE on hold-out blocks" in printed
     assert f"wrote {out / 'report.html'}" in printed
     results = json.loads((out / "results.json").read_text())
     assert results["chosen"]["joint1"]["model"] == "CVFM"

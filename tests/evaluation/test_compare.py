@@ -323,15 +323,17 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     assert scored(found, no_friction=5.0, NCFM=1.0, LFM=1.9).unfit() == {}
     runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
     assert set(runaway.unfit()) == {"LFM"}
-    assert "not fit for use: LFM: NCFM with no more parameters has" in verdict(runaway)
+    assert "not fit for use: LFM: NCFM, with no more parameters, errs by" in verdict(runaway)
     line = fit_lines("LFM", runaway.fits["LFM"], runaway.rating("LFM"))
-    assert line.startswith("LFM: do not use (in the test, NCFM with no more parameters has")
+    assert line.startswith("LFM: do not use (in the test, NCFM, with no more parameters, errs by")
     assert runaway.to_dict()["unfit"] == runaway.unfit()
     write_results(runaway, [A], [B], tmp_path, figures=False)
     # For whoever exports it later.
     stated = load_info(tmp_path / "models" / "LFM.json").rating
-    assert stated.startswith("do not use: in the test, NCFM with no more parameters has")
-    assert "it diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
+    assert stated.startswith("do not use: in the test, NCFM, with no more parameters, errs by")
+    assert (
+        "this model diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
+    )
     worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()
     assert worse == dict.fromkeys(("NCFM", "LFM"), "no friction predicts better")
     # As many parameters are no excuse.

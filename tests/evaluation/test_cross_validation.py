@@ -1,4 +1,4 @@
-"""The choice of a law: by error on blocks left out, and the simpler one where that is a draw."""
+"""The choice of a law: by error on hold-out blocks, and the simpler one where that is a draw."""
 
 import math
 import warnings

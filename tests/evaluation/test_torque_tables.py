@@ -1,4 +1,4 @@
-"""Tables of friction torque: recovery, intervals, choice by blocks left out, files."""
+"""Tables of friction torque: recovery, intervals, choice by hold-out blocks, files."""
 
 from pathlib import Path
 

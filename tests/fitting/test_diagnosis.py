@@ -154,7 +154,7 @@ def geared(play: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(("play", "named"), [(1.0, True), (0.0, False)])
 def test_play_in_a_gear_is_named(play, named):
     said = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
-    shares = [re.search(r"joint1 is loose after it reverses: (\d+) % ", w) for w in said]
+    shares = [re.search(r"gear of joint1 has play: .* (\d+) ± ", w) for w in said]
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
 
 
@@ -164,7 +164,7 @@ def test_a_fit_to_a_motor_whose_gear_has_play_is_doubtful():
     given = {"windows": (0.1,), "max_steps": 1}
     found = fit(CVFM(1), PendulumChain(**MOTOR), recording, **given)
     assert found.usability[0] == "doubtful"
-    assert "is loose after it reverses" in found.usability[1]
+    assert "joint1 has play" in found.usability[1]
     again = fit(CVFM(1), PendulumChain(**MOTOR), recording, start=found, **given)
     assert again.unmodelled == found.unmodelled
 
@@ -182,7 +182,7 @@ def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
 @pytest.mark.parametrize("change", [0.3, -0.3])
 def test_a_friction_that_changes_within_a_recording_is_named(change):
     said = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
-    named = [re.search(r"friction of joint1 (\w+) by (\S+) % \(within (\S+) %\)", w) for w in said]
+    named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in said]
     ((way, found, within),) = (match.groups() for match in named if match)
     assert way == ("grows" if change > 0 else "falls")
     start, end = 1 - change / 2, 1 + change / 2
@@ -205,7 +205,7 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
     said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
     assert len(said) == (fall > 0)
     for sentence in said:
-        found, within = re.search(r"falls by (\S+) % \(within (\S+) %\)", sentence).groups()
+        found, within = re.search(r"falls by (\S+) ± (\S+) %", sentence).groups()
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
@@ -240,7 +240,7 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
     said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
     assert len(said) == named
     for sentence in said:
-        numbers = re.search(r"grows by (\S+) % \(within (\S+) %\) in run2 relative to", sentence)
+        numbers = re.search(r"grows by (\S+) ± (\S+) % in run2 relative to", sentence)
         found, within = map(float, numbers.groups())
         assert abs(found - 30) < within < 5
 
@@ -746,7 +746,7 @@ def assert_drift(said: tuple[str, ...], factors: dict[str, float]) -> None:
     assert len(said) == len(factors)
     for sentence, (joint, factor) in zip(said, factors.items(), strict=True):
         way, found, within = re.match(
-            rf"The friction of {joint} (grows|falls) by (\S+) % \(within (\S+) %\) "
+            rf"The friction of {joint} (grows|falls) by (\S+) ± (\S+) % "
             "(?:.* to the last|in other)",
             sentence,
         ).groups()

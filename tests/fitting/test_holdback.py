@@ -192,20 +192,6 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_windows_start_at_the_states_of_the_fit(constant):
-    """From smoothed ones a search may end in another minimum of a long window."""
-    _, found = constant
-    search = refinement(constant)
-    windows = search.cut(found.motions, 0.5)
-    law = vector(replace(search, friction=found.model))
-    problem = replace(search, friction=found.model).problem(found.started(windows), 1e-3, law)
-    errors = problem.errors(problem.variables.start())
-    torch.testing.assert_close(errors, found.residuals, rtol=0, atol=1e-12)
-    # Others keep theirs.
-    other = search.cut(found.motions, 0.3)
-    assert found.started(other) is other
-
-
 def test_a_law_fitted_to_other_recordings_is_fitted_again(constant):
     joint, found = constant
     half = joint[: len(joint) // 2]

@@ -158,9 +158,9 @@ def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
         Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0,), prior_scale=0.1)
     with pytest.raises(ValueError, match="`prior_scale`"):
         Coefficient("f_o", "N m", prior_scale=0.0)
-    with pytest.raises(ValueError, match="names of their own"):
+    with pytest.raises(ValueError, match="each with its own name"):
         Law("twice", (Coefficient("B", "N m"), Coefficient("B", "N m")), linear)
-    with pytest.raises(ValueError, match="names of their own"):
+    with pytest.raises(ValueError, match="each with its own name"):
         Law("none", (), linear)
 
 

@@ -156,23 +156,29 @@ def _refuse_repeated(recordings: Sequence[Recording]) -> None:
             )
 
 
+def names_of(recordings: Sequence[Recording]) -> list[str]:
+    """Names for messages; a recording without one is named by its number."""
+    return [r.name or f"recording {k + 1}" for k, r in enumerate(recordings)]
+
+
 def require_parts(recordings: Sequence[Recording], shortest: float) -> None:
     """Refuse a recording with many gaps and no part between them of this length [s]."""
-    for k, recording in enumerate(recordings):
+    for name, recording in zip(names_of(recordings), recordings, strict=True):
         parts, count = recording.segments, len(gaps(recording.time))
         longest = max((recording.time[b] - recording.time[a] for a, b in parts), default=0.0)
         if count >= MINIMUM_SAMPLES and longest < shortest:
             raise ValueError(
-                f"`time` of {recording.name or f'recording {k + 1}'} has {count} gaps, and its "
-                f"longest part without one is {longest:.3g} s, too short for a velocity (at least "
-                f"{shortest:g} s). If a logger stamps its rows in batches, give them even times, "
-                "as `numpy.linspace(t[0], t[-1], len(t))`."
+                f"`time` of {name} has {count} gaps, and its longest part without one is "
+                f"{longest:.3g} s, too short for a velocity (at least {shortest:g} s). If a logger "
+                "stamps its rows in batches, give them even times, as `numpy.linspace(t[0], t[-1], "
+                "len(t))`."
             )
 
 
 def warn_of_undriven(recordings: Sequence[Recording]) -> None:
     """Warn of recordings without torque if others have it."""
-    free = [r.name or f"recording {k + 1}" for k, r in enumerate(recordings) if r.tau is None]
+    pairs = zip(names_of(recordings), recordings, strict=True)
+    free = [name for name, recording in pairs if recording.tau is None]
     if 0 < len(free) < len(recordings):
         names = ", ".join(dict.fromkeys(free))
         # Not of the category that is silenced once recordings are read; one place, so shown once.

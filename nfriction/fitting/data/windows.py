@@ -25,10 +25,11 @@ class Windows:
         tau: torque held over each step [N m; N], (window, step, joint).
         step: [s], (window, step); zero where a window ends early.
         weight: 1 for a sample, 0 for padding, (window, step + 1).
-        q0, qd0: initial state, from the smoothed motion or a search, (window, joint).
+        q0, qd0: initial state of the smoothed motion, the mean of its prior, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
         recordings, motions: from which the windows are cut, in joint coordinates.
+        begin: initial state from which a search starts, (window, 2 joint); by default q0, qd0.
         law_state: of a law with memory at the start of each window, relative to that of a contact
             that slips slowly, (window, joint, state).
         hidden_state: of the coefficients at the start of each window, (window, joint, state).
@@ -44,6 +45,7 @@ class Windows:
     at_rest: tuple[int, ...] = ()
     recordings: tuple[Recording, ...] = ()
     motions: tuple[Motion, ...] = ()
+    begin: Tensor | None = None
     law_state: Tensor | None = None
     hidden_state: Tensor | None = None
 
@@ -63,17 +65,22 @@ class Windows:
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
+            begin=None if self.begin is None else self.begin[index],
             law_state=None if self.law_state is None else self.law_state[index],
             hidden_state=None if self.hidden_state is None else self.hidden_state[index],
         )  # fmt: skip
 
+    @property
+    def initial(self) -> Tensor:
+        """Initial state from which a search starts, (window, 2 joint)."""
+        return torch.cat([self.q0, self.qd0], -1) if self.begin is None else self.begin
+
     def starting_at(self, states: Tensor) -> "Windows":
-        """The windows from these positions and velocities, (window, ...), unless they are known."""
-        joints = self.q0.shape[-1]
-        q0, qd0 = (x.clone() for x in states[:, : 2 * joints].chunk(2, -1))
-        known = list(self.at_rest)
-        q0[known], qd0[known] = self.q0[known], self.qd0[known]
-        return replace(self, q0=q0, qd0=qd0)
+        """The windows with searches from these states, (window, ...), unless they are known."""
+        smoothed, known = torch.cat([self.q0, self.qd0], -1), list(self.at_rest)
+        begin = states[:, : smoothed.shape[-1]].clone()
+        begin[known] = smoothed[known]
+        return replace(self, begin=begin)
 
     def with_states(self, plant: Plant, model: FrictionModel) -> "Windows":
         """The windows with the state of the friction at the start of each.

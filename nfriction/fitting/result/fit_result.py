@@ -14,7 +14,6 @@ from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY
 from nfriction.fitting.data.inputs import advanced_torques, weighs
-from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
@@ -81,8 +80,6 @@ class FitResult:
         motions: smoothed motion of each recording, in joint coordinates.
         residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
             after an equation-error fit.
-        window_states: position and velocity at the start of each training window, (window,
-            2 joint) [rad, rad/s; m, m/s], without encoder offsets; empty like `residuals`.
         intervals: 95 % confidence intervals of constant coefficients and plant terms, from the
             effective sample size of autocorrelated residuals. After an equation-error fit they
             assume that the plant and the smoothed motion are exact.
@@ -116,7 +113,6 @@ class FitResult:
     steps: int
     motions: tuple[Motion, ...]
     residuals: Tensor
-    window_states: Tensor
     intervals: tuple[Interval, ...] = ()
     unidentifiable: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -137,14 +133,6 @@ class FitResult:
         usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
         return usable[-1] if usable else windows[0]
 
-    def started(self, windows: Windows) -> Windows:
-        """Windows of the same recordings from the states of the fit, if it had the same windows.
-
-        From smoothed states a search may miss the minimum of a long window.
-        """
-        same = self.residuals.shape == windows.q.shape
-        return windows.starting_at(self.window_states) if same else windows
-
     def with_warnings(
         self,
         data_warnings: Sequence[str],
@@ -159,6 +147,12 @@ class FitResult:
             mistakes=tuple(dict.fromkeys((*mistakes, *self.mistakes))),
             unmodelled=tuple(dict.fromkeys((*unmodelled, *self.unmodelled))),
         )  # fmt: skip
+
+    def without(self, warnings: Sequence[str]) -> "FitResult":
+        """The same without these warnings."""
+        kinds = (self.warnings, self.data_warnings, self.unmodelled)
+        kept, of_data, unmodelled = (tuple(w for w in own if w not in warnings) for own in kinds)
+        return replace(self, warnings=kept, data_warnings=of_data, unmodelled=unmodelled)
 
     @property
     def usability(self) -> tuple[Usability, str]:
@@ -252,12 +246,12 @@ class FitResult:
         rules = self.model.schedule.fuzzy_rules()
         if rules is None:
             return []
-        total: Tensor | float = 0.0
+        seconds = []
         for motion in self.motions:
             step = np.diff(motion.time, append=motion.time[-1])
             step[gaps(motion.time)] = 0.0
-            total = total + rules.seconds(*map(torch.as_tensor, (step, motion.qd, motion.qdd)))
-        return [] if isinstance(total, float) else total.tolist()
+            seconds.append(rules.seconds(*map(torch.as_tensor, (step, motion.qd, motion.qdd))))
+        return torch.stack(seconds).sum(0).tolist() if seconds else []
 
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
@@ -308,7 +302,9 @@ class FitResult:
         notes = dict.fromkeys(rows, "") | dict.fromkeys(self.at_bounds, "at a bound")
         names = zip(schedule.coefficient_names, schedule.fitted_mask, strict=True)
         kept = [name for name, fitted in names if not fitted]
-        notes |= {name: "not fitted" for name in rows if name.split(" of ")[0] in kept}
+        # A constant term of a network has an interval.
+        unfitted = [name for name, (_, low, _) in rows.items() if math.isnan(low)]
+        notes |= {name: "not fitted" for name in unfitted if name.split(" of ")[0] in kept}
         notes |= dict.fromkeys(unknown, "not identifiable")
         table["note"] = [notes[name] for name in rows]
         return table.rename_axis("parameter")

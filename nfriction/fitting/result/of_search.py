@@ -90,7 +90,6 @@ def result_from_equation_error(
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
-        window_states=torch.zeros(0, dtype=torch.float64),
         intervals=identifiability.confidence_intervals(
             fitted_names, values, sd, lower, upper, model.law
         ),
@@ -155,7 +154,6 @@ def result_from_shooting(
         steps=result.steps,
         motions=motions,
         residuals=residuals,
-        window_states=variables.true_states(x),
         intervals=intervals,
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),

@@ -1,7 +1,9 @@
 """Paired test: errors of two models on the same windows or blocks, beyond their scatter."""
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,7 +39,12 @@ def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
     if count < 2:
         return ratio, math.inf
     without = 0.5 * torch.log((new.sum() - new) / (old.sum() - old))
-    return ratio, float(((count - 1) * without.var(correction=0)).sqrt())
+    return ratio, jackknife_sd(without.tolist())
+
+
+def jackknife_sd(without: Sequence[float]) -> float:
+    """Standard error of an estimate, from those with each piece of the data left out in turn."""
+    return math.sqrt((len(without) - 1) * float(np.var(without)))
 
 
 def student_quantile(freedom: int, level: float) -> float:

@@ -1,15 +1,16 @@
 """Output error by multiple shooting: a cost and its Gauss-Newton model.
 
-A recording is cut into windows. Each is simulated from its own initial state, because the motion of
-a light mechanism forgets its start within seconds; for a law with memory the deflections are part
-of that state. The decision variables x are the friction parameters, the plant terms, each window's
-initial state and the encoders' offsets, and the cost is
+A recording is cut into windows. Each is simulated from its own initial state, because within
+seconds a light mechanism amplifies an error of that state beyond use; for a law with memory the
+deflections are part of it. The decision variables x are the friction parameters, the plant terms,
+each window's initial state and the encoders' offsets, and the cost is
 
     J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      samples (or a robust loss)
          + 1/2 sum (x - mean)^2 / sd^2                          priors
 
-with C the matrix from joint to recorded coordinates. Plant and friction model stay unchanged. The
-next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
+and for networks a prior where nothing was recorded. C is the matrix from joint to recorded
+coordinates. Plant and friction model stay unchanged. The next step is
+`nfriction.optim.levenberg_marquardt`, which minimises J.
 
 References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
@@ -87,12 +88,12 @@ class ShootingProblem:
         With `states`, without derivatives with respect to the shared variables.
         """
         held = self.variables.shared_count if states else 0
-        run = self.simulate(x, with_memory=True)
+        run = self.simulate(x, with_hidden_states=True)
         errors = self.deviation(x, run)
         scale = self.scale * self.loss.weight(errors).sqrt()
         rows = self.rows(run, scale, states=states)
         gradient, hessian = normal_equations(
-            rows, errors * scale, self.variables.indices() - held, len(x) - held
+            rows, errors * scale, self.variables.indices(alone=states), len(x) - held
         )
         if self.extrapolation is not None and not states:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
@@ -152,8 +153,11 @@ class ShootingProblem:
         """A copy of the friction model, which every simulation sets to its parameters."""
         return substepped(self.friction, self.substeps)
 
-    def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`, valid until the next call; derivatives need its memory."""
+    def simulate(self, x: Tensor, *, with_hidden_states: bool = False) -> Trajectory:
+        """The windows' motion at `x`, valid until the next call.
+
+        Derivatives need the coefficients' hidden states along it, `with_hidden_states`.
+        """
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
         model.schedule.set_parameter_vector(friction)
@@ -167,7 +171,7 @@ class ShootingProblem:
             hidden_state=self.windows.hidden_state,
         )  # fmt: skip
         motion = self._integrate(self.plant_at(plant), model, inputs)
-        memory = self.windows.states_along(model, motion) if with_memory else None
+        memory = self.windows.states_along(model, motion) if with_hidden_states else None
         return Trajectory(model, plant, motion, linearised, step, memory, law_slope)
 
     def _torques(self, plant: Tensor) -> tuple[Tensor, Tensor]:
@@ -196,5 +200,4 @@ class ShootingProblem:
     def rows(self, run: Trajectory, scale: Tensor, *, states: bool = False) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time; `states`: see `linearise`."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride, states=states)
-        indices = self.variables.indices() - self.variables.shared_count * states
-        return scaled_rows(pieces, scale, self.measurement, indices)
+        return scaled_rows(pieces, scale, self.measurement, self.variables.indices(alone=states))

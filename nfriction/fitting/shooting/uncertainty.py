@@ -84,7 +84,7 @@ def _once_fitted(problem: ShootingProblem, x: Tensor, response: Tensor) -> float
     variables, off = problem.variables, response * problem.scale
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
-    rows = problem.rows(problem.simulate(x, with_memory=True), problem.scale)
+    rows = problem.rows(problem.simulate(x, with_hidden_states=True), problem.scale)
     gradient, hessian = normal.normal_equations(rows, off, variables.indices(), len(x))
     gradient, hessian = gradient[free], hessian[free][:, free]
     hessian.diagonal().add_(variables.prior()[0][free])
@@ -110,7 +110,7 @@ def gathered_information(
     Errors due to the torque's noise are added: they last longer than a window, whose free initial
     state absorbs most of them, so that residuals show too little of their autocorrelation.
     """
-    variables, run = problem.variables, problem.simulate(x, with_memory=True)
+    variables, run = problem.variables, problem.simulate(x, with_hidden_states=True)
     shared, (precision, _) = variables.shared_count, variables.prior()
     of_states, of_offsets = variables.split(precision)[2:]
     kept = normal.Kept(variables.indices(), variables.state_count, len(x))
@@ -193,7 +193,7 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
         finer = replace(finer, friction=deepcopy(problem.friction))
         finer.friction.v_smooth /= FINER
     off = _positions(finer, x) - _positions(problem, x)
-    run = problem.simulate(x, with_memory=True)
+    run = problem.simulate(x, with_hidden_states=True)
     weight = problem.loss.weight(problem.deviation(x, run))
     rows = problem.rows(run, problem.scale * weight.sqrt())
     scaled = off * problem.scale * weight.sqrt()

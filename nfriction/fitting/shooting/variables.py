@@ -124,12 +124,14 @@ class DecisionVariables:
         offsets: Tensor | None = None,
         friction: Tensor | None = None,
     ) -> Tensor:
-        """Vector at the smoothed initial states; the other parts by default unchanged."""
+        """Vector at the windows' initial states; the other parts by default unchanged."""
         friction = self.schedule.parameter_vector() if friction is None else friction
         zeros = torch.zeros(len(self.terms) + self.offset_count, dtype=torch.float64)
         plant = zeros[: len(self.terms)] if plant is None else plant
         offsets = zeros[len(self.terms) :] if offsets is None else offsets.reshape(-1)
-        return torch.cat([friction, plant, self._smoothed(), offsets])
+        states, initial = self._smoothed().reshape(len(self.windows), -1), self.windows.initial
+        states[:, : initial.shape[-1]] = initial
+        return torch.cat([friction, plant, states.reshape(-1), offsets])
 
     def split(self, x: Tensor) -> Parts:
         """The parts of a vector."""
@@ -143,12 +145,6 @@ class DecisionVariables:
         """Encoder offset of each window's recording, (window, joint)."""
         offsets = self.split(x).offsets
         return offsets[self._recording()] if len(offsets) else torch.zeros_like(self.windows.q0)
-
-    def true_states(self, x: Tensor) -> Tensor:
-        """Positions without encoder offsets and velocities at the starts, (window, 2 joint)."""
-        states, offsets = self.split(x).states, self.window_offsets(x)
-        joints = offsets.shape[-1]
-        return torch.cat([states[:, :joints] + offsets, states[:, joints : 2 * joints]], 1)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds; equal for variables that are not fitted."""
@@ -169,14 +165,17 @@ class DecisionVariables:
         mean = torch.cat([mean, plant_mean, self._smoothed(), torch.zeros_like(offset_sd)])
         return sd.square().reciprocal(), mean
 
-    def indices(self) -> Tensor:
-        """Indices of each window's own variables, its state and its offsets, (window, any)."""
+    def indices(self, *, alone: bool = False) -> Tensor:
+        """Indices of each window's own variables, its state and its offsets, (window, any).
+
+        In a vector of all variables, or without the shared ones if `alone`.
+        """
         states = torch.arange(len(self.windows) * self.state_count).reshape(len(self.windows), -1)
-        states = states + self.shared_count
+        states = states + self.shared_count * (not alone)
         if not self.offset_count:
             return states
         joints = self.windows.q0.shape[-1]
-        first = self.shared_count + states.numel() + joints * self._recording()
+        first = states[-1, -1] + 1 + joints * self._recording()
         return torch.cat([states, first[:, None] + torch.arange(joints)], 1)
 
     def _recording(self) -> Tensor:

@@ -42,9 +42,9 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
 
-# Causes of skipped windows that a user can eliminate.
+# Causes of skipped windows that a user should know.
 SKIPPED = {
-    "too long": "the motion forgets its start within them, or law or plant are wrong",
+    "too long": "the motion is chaotic within them, or law or plant are wrong",
     "lossy": (
         "their parameters would be worse at shorter windows; errors of the torque add up over long "
         "windows, and a wrong law or plant has the same effect"
@@ -214,6 +214,8 @@ def best_of_starts(
         return own.as_stopped()
     options, law = fitter.options, fitter.friction.law
     windows = nested.problem.windows.starting_at(nested.parts.states)
+    q0, qd0 = windows.initial.chunk(2, -1)
+    windows = replace(windows, q0=q0, qd0=qd0)
     same = windows.spans == own.problem.windows.spans
     # If one of the two failed at the longest windows, their residuals cannot be compared.
     if not same and len(windows) >= len(own.problem.windows):

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
@@ -31,9 +30,9 @@ from nfriction.fitting.strategy.holdout import StoppedError
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
-    fits_eccentricity,
     known_terms,
     regression,
+    terms_after,
 )
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated, HeatedConstant
@@ -204,11 +203,7 @@ def _fitter(
             seen = cast("Heated", at.model.schedule)
             schedule.set_heat(seen.heat_capacity, seen.cooling_time, seen.sample_time)
     model = FrictionModel(law, schedule, at.model.v_smooth)
-    terms = adjustable_terms(
-        plant, law, task.recordings, task.options,
-        eccentric=fits_eccentricity(task.options, at), per_recording=bool(at.encoder_offsets),
-    )  # fmt: skip
-    torque = regression(task, model, fitted)
+    torque, terms = regression(task, model, fitted), terms_after(task, at, law, plant)
     return ShootingFitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, task.options,
         task.callback, friction_prior=constant_prior(model, torque, task.options),
@@ -218,48 +213,52 @@ def _fitter(
 def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
     """Constant fit of a law with inputs, started from that without; None if stopped.
 
-    The cooling time of heat minimises the residual, between the length of a window (within which
-    a network responds to the motion itself) and that of the longest recording.
+    Windows grow to those of the law, where it may be far from the law with inputs. The cooling time
+    of heat minimises the residual over the shortest windows, between their length (within which a
+    network responds to the motion itself) and that of the longest recording.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
     horizon = start.longest_usable_horizon(task.options.windows)
-    longest = longest_duration(task.motions)
-    ends: list[HorizonResult] = []
+    lengths = tuple(length for length in task.options.windows if length <= horizon)
+    shortest, longest = min(lengths), longest_duration(task.motions)
+
+    def continued(windows: Sequence[float], cooling_time: float) -> HorizonResult:
+        fitter = widened_fitter(task, start, inputs, cooling_time)
+        friction = fitter.friction.schedule.parameter_vector()
+        plant, options = known_terms(start, fitter.jacobian.terms), task.options
+        noise, simulated, found = options.first_noise, task.motions, None
+        for k, length in enumerate(windows):
+            problem = fitter.problem(fitter.cut(simulated, length, task.motions), noise, friction)
+            x, stopped = settle_states(problem, problem.variables.start(plant))
+            near = weighted_cost(found.residuals, noise) if found else float(problem.cost(x))
+            last = k + 1 == len(windows)
+            tolerance = loglik_tolerance(near, options) if last else options.loose_tolerance
+            name = f"{problem.windows.length:g} s windows, law with inputs"
+            found = fitter.search(problem, x, tolerance, name)
+            if stopped or found.stopped or not math.isfinite(found.rms):
+                raise StoppedError
+            noise, (friction, plant, *_) = max(found.noise, options.min_noise), found.parts
+            simulated = problem.simulated_motions(found.result.x, simulated)
+        assert found is not None
+        return found
 
     def residual(log_time: float) -> float:
-        """Residual of a search with this cooling time, started from the best of those before."""
-        fitter = widened_fitter(task, start, inputs, math.exp(log_time))
-        friction = fitter.friction.schedule.parameter_vector()
-        plant, residuals = known_terms(start, fitter.jacobian.terms), start.residuals
-        windows = start.started(fitter.cut(task.motions, horizon))
-        # With the noise of the law without inputs, a first search is pulled toward the prior, and
-        # its windows start with the heat of the previous friction.
-        for _ in range(1 if ends else 2):
-            if ends:
-                lowest = min(ends, key=lambda end: end.rms)
-                (friction, plant, states, _), residuals = lowest.parts, lowest.residuals
-                windows = windows.starting_at(states)
-            noise = max(effective_noise(residuals), task.options.min_noise)
-            tolerance = loglik_tolerance(weighted_cost(residuals, noise), task.options)
-            problem = fitter.problem(windows, noise, friction)
-            x, stopped = settle_states(problem, problem.variables.start(plant))
-            end = fitter.search(problem, x, tolerance, "law with further inputs")
-            if stopped or end.stopped or not math.isfinite(end.rms):
-                raise StoppedError
-            ends.append(end)
-        return end.rms
+        # Twice, because the first time windows start with the heat of the law without inputs.
+        return continued((shortest, shortest), math.exp(log_time)).rms
 
     try:
-        residual(math.log(longest))
-        if "heat" in inputs and longest > horizon:
-            between = math.log(horizon), math.log(longest)
-            minimize_scalar(residual, bounds=between, method="bounded", options={"xatol": 0.2})
+        if "heat" in inputs and longest > shortest:
+            between = math.log(shortest), math.log(longest)
+            best = minimize_scalar(
+                residual, bounds=between, method="bounded", options={"xatol": 0.2}
+            )
+            longest = math.exp(best.x)
+        end = continued(lengths, longest)
     except StoppedError:
         return None
-    best = min(ends, key=lambda end: end.rms)
-    model = copy.deepcopy(best.problem.friction)
-    found = result_from_shooting(model, best.problem, best.result, task.motions)
+    model = copy.deepcopy(end.problem.friction)
+    found = result_from_shooting(model, end.problem, end.result, task.motions)
     return replace(
         found, encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons
     )
@@ -311,14 +310,19 @@ def chosen_inputs(
         if not found:
             return tuple(chosen), at, seeing
         _, gain, kind = max(found, key=lambda one: one[0])
-        chosen.append(gain)
+        widening = seeing
         if gain.name == kind:
             tasks = {kind: tasks[kind]}
-            seeing = replace(tasks[kind], plant=seeing_plant(tasks[kind].plant, [kind]))
-        widened = widened_start(seeing, start, [gain.name for gain in chosen])
+            widening = replace(tasks[kind], plant=seeing_plant(tasks[kind].plant, [kind]))
+        widened = widened_start(widening, start, [*held, gain.name])
         if widened is None:
             raise StoppedError
-        at = widened
+        if not widened.residual < at.residual:
+            return tuple(chosen), at, seeing
+        # As found by the search; the linearisation predicts only the choice.
+        share = 1.0 - (widened.residual / at.residual) ** 2
+        chosen.append(replace(gain, share=share))
+        at, seeing = widened, widening
 
 
 @dataclass(frozen=True)
@@ -334,16 +338,17 @@ class _Choice:
     def of(
         cls, fitter: ShootingFitter, task: FitTask, start: FitResult, names: Mapping[str, str]
     ) -> "_Choice | None":
-        horizon = start.longest_usable_horizon(task.options.windows)
-        windows = start.started(fitter.cut(task.motions, horizon))
-        noise, model = effective_noise(start.residuals), fitter.friction
-        stride = decimation(start.residuals, task.options)
-        values = model.schedule.parameter_vector()
-        problem = fitter.problem(windows, noise, values, stride=stride)
+        # The shortest windows: over them the motion is most nearly linear in friction.
+        model, values = fitter.friction, fitter.friction.schedule.parameter_vector()
+        windows = fitter.cut(task.motions, min(task.options.windows))
+        problem = fitter.problem(windows, effective_noise(start.residuals), values)
         variables = problem.variables
         x, stopped = settle_states(
             problem, variables.start(known_terms(start, fitter.jacobian.terms))
         )
+        residuals = problem.errors(x)
+        noise = max(effective_noise(residuals), task.options.min_noise)
+        problem = replace(problem, noise_sd=noise, stride=decimation(residuals, task.options))
         local = problem.linearise(x)
         if stopped or not local.finite:
             return None

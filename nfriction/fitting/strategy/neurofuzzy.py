@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
+from nfriction.fitting.data.inputs import apply_encoder_offsets, require_motion
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import DEFAULTS, FitOptions
@@ -43,9 +43,9 @@ from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_ce
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
-    fits_eccentricity,
     known_terms,
     regression,
+    terms_after,
 )
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated
@@ -109,12 +109,10 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     said = [gain.words(found.plant.joint_names) for gain in chosen]
     if has_input(model.law, "position") and widened is not None:
         said.append(_ripple(found.plant))
-    unmodelled = start.unmodelled
     if has_input(model.law, "heat"):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
-        unmodelled = tuple(text for text in unmodelled if text not in task.drift)
     found = replace(found, status=" ".join([found.status, *said]))
-    return found.with_warnings(start.data_warnings, unmodelled=unmodelled)
+    return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
 def _ripple(plant: Plant) -> str:
@@ -122,7 +120,8 @@ def _ripple(plant: Plant) -> str:
     rows = zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)
     peaks = (f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in rows)
     at = ", ".join(peaks)
-    return f"Friction by position is largest at {at}, as long as encoders keep their zeros."
+    angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
+    return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:
@@ -140,7 +139,7 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     if worse or (new.several and gains(old.of_law_apart, new.of_law_apart, chance)):
         return (), plain
     rival.train()
-    better = gains(rival.squares, plain.squares, least=task.options.explained_ratio)
+    better = gains(rival.squares, plain.squares, least=task.options.network_gain)
     # Friction of the constant law may drive a joint even if that of its network does not.
     drives = inputs.drives(rival.found, len(task.model.law.names))
     return (chosen, rival) if better and not drives else ((), plain)
@@ -158,10 +157,7 @@ class _Contest:
         self.network = initialise_from_constant(
             task.model, start, task.recordings, task.motions, options
         )
-        terms = adjustable_terms(
-            task.plant, start.model.law, task.recordings, options,
-            eccentric=fits_eccentricity(options, start), per_recording=bool(start.encoder_offsets),
-        )  # fmt: skip
+        terms = terms_after(task, start, start.model.law, task.plant)
         plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
         schedule = cast("NeuroFuzzy", self.network.schedule)
         self.free = ShootingFitter(
@@ -177,8 +173,7 @@ class _Contest:
 
     def accepts(self, trial: "Trial") -> bool:
         """True if the network beats the law on hold-out windows."""
-        # Noise explains errors up to this multiple of it, so a smaller gain may be noise.
-        least = self.task.options.explained_ratio
+        least = self.task.options.network_gain
         return gains(trial.squares, self.validation.of_law, least=least)
 
     @property
@@ -219,7 +214,7 @@ class _Contest:
         except holdout.StoppedError:
             end = best.end.as_stopped()
         if not self.accepts(best):
-            least = task.options.explained_ratio
+            least = task.options.network_gain
             note = holdout.verdict(best.squares, validation.of_law, least=least)
         if note:
             return self._kept(model, note, converged=not end.stopped)
@@ -380,10 +375,10 @@ class Validation:
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
     ) -> None:
         assert law.plant_prior is not None
-        self.law, self.length, self.options = law, length, law.options
+        self.law, self.motions, self.length, self.options = law, motions, length, law.options
         self.plant = law.plant_prior[0]
         self.cut = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
-        self.of_start = start.started(law.cut(motions, length))
+        self.residuals = start.residuals
         # The noise that sets the weight of the priors is the residual of the constant law at the
         # same horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
@@ -522,12 +517,17 @@ class Validation:
 
         Hold-out windows are shorter, and insensitive to small torque errors.
         """
-        windows = self.of_start
+        # From the states of the network's own fit: smoothed ones may lead to another minimum.
+        simulated = end.problem.simulated_motions(end.result.x, self.motions)
+        windows = self.law.cut(simulated, self.length, self.motions)
         if end.stopped or windows.spans == self.windows.spans:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
-        problem = self.law.problem(windows, self.noise, law)
-        of_law = holdout.settled(windows, problem, law, self.plant)
+        of_law = self.residuals.square()
+        # A law that was fitted to windows of other lengths.
+        if of_law.shape != windows.q.shape:
+            problem = self.law.problem(windows, self.noise, law)
+            of_law = holdout.settled(windows, problem, law, self.plant)
         network = holdout.settled(windows, end.problem, friction, plant)
         worse = 100 * (float((network.mean() / of_law.mean()).sqrt()) - 1)
         return LOST.format(windows.length, worse) if worse > 0 else ""

@@ -14,11 +14,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import (
-    adjustable_terms,
-    apply_encoder_offsets,
-    integration_substeps,
-)
+from nfriction.fitting.data.inputs import apply_encoder_offsets, integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import EncoderReference, FitOptions
@@ -30,7 +26,7 @@ from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
 from nfriction.fitting.strategy.neurofuzzy import constant_kept, log_evidence
-from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
+from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task, terms_after
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import DEFAULTS, AccelerationClasses, ClassOptions, find_classes
@@ -117,10 +113,7 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     length = constant.longest_usable_horizon(options.windows)
     by_class = ClassFit.of(task, schedule, constant, length, classes)
     task, given, windows = by_class.task, by_class.given, by_class.windows
-    terms = adjustable_terms(
-        task.plant, given.law, task.recordings, options,
-        per_recording=bool(constant.encoder_offsets),
-    )  # fmt: skip
+    terms = terms_after(task, constant, given.law, task.plant)
     vector = known_terms(constant, terms)
     sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
     fitter = ClassFitter(
@@ -337,7 +330,7 @@ class ClassFit:
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
         # Windows are compared in joint coordinates, without encoder offsets.
         corrected = replace(task, recordings=joint, motions=motions)
-        windows = constant.started(cut_windows(joint, motions, length))
+        windows = cut_windows(joint, motions, length)
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property

@@ -399,7 +399,7 @@ def fit_by_search(
         options: method, windows and limits.
         classes: of an adaptive model, see `fit_adaptive`.
         start: fit to start from; for an adaptive model, that of the constant law. By default the
-            constant coefficients that the torques imply (adaptive: the trajectory fit).
+            constant coefficients that the torques imply (adaptive: the output-error fit).
         motions: smoothed motions in joint coordinates.
         callback: called after every iteration; True stops.
 
@@ -463,7 +463,6 @@ def fit_by_search(
         steps=result.iterations,
         motions=task.motions,
         residuals=residuals,
-        window_states=torch.cat([windows.q0, windows.qd0], 1),
     )
     if by_class is None:
         return found

@@ -115,7 +115,7 @@ SECOND = (
          "Measured from hanging, as in that paper.",
          figures={"second_fig_3_free_arm": lambda _: figures.second_swing()}),
     Item("Tables I, II, III: coefficients", "Coefficients of the twin.",
-         {f"second_table_{roman.lower()}": (f"second paper, Table {roman}: {law} by {method}",
+         {f"second_table_{roman.lower()}": (f"RTIP paper, Table {roman}: {law} by {method}",
                                             partial(tables.second_coefficients, law=law))
           for roman, law, method in zip(
               ("I", "II", "III"), LAWS,
@@ -129,7 +129,7 @@ SECOND = (
          "Dots: the torque that the smoothed motion implies.",
          figures={"second_fig_8_torque": figures.second_torque}),
     Item("Table IV: position error", "",
-         {"second_table_iv": ("second paper, Table IV: position RMSE [mrad] on test releases, free "
+         {"second_table_iv": ("RTIP paper, Table IV: position RMSE [mrad] on test releases, free "
                               "runs", tables.second_table_4)},
          {"second_rmse": lambda workspace: rmse_bars(
              tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad")}),

@@ -54,12 +54,12 @@ LAWS = {"NCFM": "viscous", "LFM": "linear", "NLFM": "nonlinear"}
 CONSTANT = (*LAWS, "Stribeck")
 ADAPTIVE = tuple(f"A{law}" for law in LAWS)
 BY_PATTERN = tuple(f"{name}-pattern" for name in ADAPTIVE)
-"""Adaptive models fitted by the first paper's pattern search."""
+"""Adaptive models fitted by the TLRIP paper's pattern search."""
 NEURO_FUZZY = tuple(f"NF{law}" for law in LAWS)
 PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
-"""The second paper's method for each model."""
+"""The RTIP paper's method for each model."""
 EXPERIMENT = "experiment"
 """Twin of the TLRIP paper's friction experiment, whose classes are given in its Table 6."""
 
@@ -252,7 +252,7 @@ def fit_searched(
 
 
 def fit_by_pattern(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """An adaptive model by the first paper's method, from its constant fit."""
+    """An adaptive model by the TLRIP paper's method, from its constant fit."""
     law = name.removeprefix("A").removesuffix("-pattern")
     return fit_searched(
         workspace, bench, name, "pattern", workspace.settings.windows[-1],
@@ -293,7 +293,7 @@ def fitted(
 
 
 def second_paper(workspace: Workspace, name: str) -> dict[str, Any]:
-    """Result of a search on the second paper's rig."""
+    """Result of a search on the RTIP paper's rig."""
     bench, method = workspace.bench("rtip"), SEARCH[name.removeprefix("rtip-")]
     horizon = workspace.settings.search_horizon
     found = fit_searched(workspace, bench, name, method, horizon, threads=1)

@@ -188,7 +188,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
 
 
 def second_table_4(workspace: Workspace) -> pd.DataFrame:
-    """Position RMSE on the second paper's rig, beside Table IV of the RTIP paper."""
+    """Position RMSE on the RTIP paper's rig, beside its Table IV."""
     # Stages of this rig have a prefix that the table does not need.
     ours = rmse(workspace, SECOND_PAPER).set_axis(list(LAWS))
     return _beside(ours, _table(SECOND_TABLE_4))
@@ -289,7 +289,7 @@ def conclusion(workspace: Workspace) -> str:
             PAPERS_WAY, ADAPTIVE,
         ),
         claim(
-            f"on the second paper's rig five coefficients are best, {said(SECOND_PAPER)}",
+            f"on the RTIP paper's rig five coefficients are best, {said(SECOND_PAPER)}",
             (five,) * len(simple), simple,
         ),
         f"Why: a curve over speed fails to explain {missed['speed']:.1%} of the true friction "

@@ -176,10 +176,9 @@ class Workspace:
                 ("inputs", InputGain),
             ):
                 plain[field] = tuple(kind(*row) for row in plain[field])
-            plain |= {field: torch.as_tensor(x) for field, x in self.arrays(name).items()}
             return FitResult(
                 model=load(path), plant=load_plant(path), motions=tuple(bench.train_motions),
-                **plain,
+                residuals=torch.as_tensor(self.arrays(name)["residuals"]), **plain,
             )  # fmt: skip
         losses: dict[str, list[float]] = {}
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
@@ -196,7 +195,7 @@ class Workspace:
             found = make(step)
         self.finish(f"{stage}-losses", losses)
         # The JSON file comes last: it marks the stage as finished.
-        self.write_arrays(name, {field: getattr(found, field).numpy() for field in _ARRAYS})
+        self.write_arrays(name, {"residuals": found.residuals.numpy()})
         save(found.model, path, model_info(found, bench.train))
         plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _APART}
         # Bounds and intervals may be infinite.
@@ -234,8 +233,7 @@ class Workspace:
 
 
 # Fields of a fit that are stored separately, with the twin, or not at all; others are plain JSON.
-_ARRAYS = ("residuals", "window_states")
-_APART = ("model", "plant", "motions", "uncertainty", *_ARRAYS)
+_APART = ("model", "plant", "motions", "uncertainty", "residuals")
 
 
 def _tuples(value: Any) -> Any:
