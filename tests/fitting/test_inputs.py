@@ -180,8 +180,9 @@ class Contest:
 
     found, several = None, True
 
-    def __init__(self, task, start, of_law=ONE, error=ONE, apart=None) -> None:
+    def __init__(self, task, start, of_law=ONE, error=ONE, apart=None, accepted=True) -> None:
         self.task, self.start, self.validation = task, start, self
+        self.accepted = accepted
         self.of_law, self.final = of_law, error
         self.of_law_apart = of_law if apart is None else apart
         self.trained = False
@@ -215,6 +216,14 @@ def task():
             {"of_law": 0.8 * ONE, "error": 0.7 * ONE, "apart": torch.linspace(0.7, 1.6, 6)},
             False,
             True,
+            True,
+        ),
+        # A law without a network has to gain as much on hold-out recordings.
+        ({"of_law": 0.8 * ONE, "error": 0.8 * ONE, "accepted": False}, False, True, True),
+        (
+            {"of_law": 0.8 * ONE, "error": 0.8 * ONE, "apart": 0.9 * ONE, "accepted": False},
+            False,
+            False,
             True,
         ),
     ],

@@ -134,12 +134,16 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     rival = _Contest(replace(seeing, model=model), start)
     new, old, chance = rival.validation, plain.validation, task.options.input_chance
+    least = task.options.network_gain
     # An input may show only in the network: the law alone need not gain.
     worse = gains(old.of_law, new.of_law, chance)
     if worse or (new.several and gains(old.of_law_apart, new.of_law_apart, chance)):
         return (), plain
     rival.train()
-    better = gains(rival.squares, plain.squares, least=task.options.network_gain)
+    better = gains(rival.squares, plain.squares, least=least)
+    # Windows between those of training show the same motion, so recordings have to confirm a law.
+    if better and new.several and not rival.accepted:
+        better = gains(new.of_law_apart, old.of_law_apart, chance, least)
     # Friction of the constant law may drive a joint even if that of its network does not.
     drives = inputs.drives(rival.found, len(task.model.law.names))
     return (chosen, rival) if better and not drives else ((), plain)
@@ -177,16 +181,21 @@ class _Contest:
         return gains(trial.squares, self.validation.of_law, least=least)
 
     @property
+    def accepted(self) -> bool:
+        """True if the best network beats the law."""
+        return self.best is not None and self.accepts(self.best)
+
+    @property
     def squares(self) -> Tensor:
         """Squared errors of the network if it is accepted, else of the law, (window,)."""
         assert self.best is not None
-        return self.best.squares if self.accepts(self.best) else self.validation.of_law
+        return self.best.squares if self.accepted else self.validation.of_law
 
     @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network if it is accepted."""
         assert self.best is not None
-        if not self.accepts(self.best):
+        if not self.accepted:
             return self.start
         problem, parts = self.best.end.problem, self.best.end.parts
         model, plant = model_at(problem.friction, parts.friction), problem.plant_at(parts.plant)
