@@ -223,45 +223,58 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     lengths = tuple(length for length in task.options.windows if length <= horizon)
     shortest, longest = min(lengths), longest_duration(task.motions)
 
-    def continued(windows: Sequence[float], cooling_time: float) -> HorizonResult:
-        fitter = widened_fitter(task, start, inputs, cooling_time)
+    def continued(
+        windows: Sequence[float], cooling_time: float, end: HorizonResult | None
+    ) -> HorizonResult:
+        fitter, options = widened_fitter(task, start, inputs, cooling_time), task.options
         friction = fitter.friction.schedule.parameter_vector()
-        plant, options = known_terms(start, fitter.jacobian.terms), task.options
-        noise, simulated, found = options.first_noise, task.motions, None
+        plant, noise = known_terms(start, fitter.jacobian.terms), options.first_noise
+        simulated = task.motions
         for k, length in enumerate(windows):
+            if end is not None:
+                noise, (friction, plant, *_) = max(end.noise, options.min_noise), end.parts
+                simulated = end.problem.simulated_motions(end.result.x, simulated)
             problem = fitter.problem(fitter.cut(simulated, length, task.motions), noise, friction)
             x, stopped = settle_states(problem, problem.variables.start(plant))
-            near = weighted_cost(found.residuals, noise) if found else float(problem.cost(x))
+            near = float(problem.cost(x)) if end is None else weighted_cost(end.residuals, noise)
             last = k + 1 == len(windows)
             tolerance = loglik_tolerance(near, options) if last else options.loose_tolerance
             name = f"{problem.windows.length:g} s windows, law with inputs"
-            found = fitter.search(problem, x, tolerance, name)
-            if stopped or found.stopped or not math.isfinite(found.rms):
+            end = fitter.search(problem, x, tolerance, name)
+            if stopped or end.stopped or not math.isfinite(end.rms):
                 raise StoppedError
-            noise, (friction, plant, *_) = max(found.noise, options.min_noise), found.parts
-            simulated = problem.simulated_motions(found.result.x, simulated)
-        assert found is not None
-        return found
+        assert end is not None
+        return end
+
+    ends: list[HorizonResult] = []
+
+    def best() -> HorizonResult | None:
+        return min(ends, key=lambda end: end.rms, default=None)
 
     def residual(log_time: float) -> float:
-        # Twice, because the first time windows start with the heat of the law without inputs.
-        return continued((shortest, shortest), math.exp(log_time)).rms
+        end, before = best(), math.inf
+        # Repeated, because a window starts with the heat of the friction that was found before.
+        while end is None or before > task.options.network_gain * end.rms:
+            before = math.inf if end is None else end.rms
+            end = continued((shortest,), math.exp(log_time), end)
+        ends.append(end)
+        return end.rms
 
     try:
         if "heat" in inputs and longest > shortest:
             between = math.log(shortest), math.log(longest)
-            best = minimize_scalar(
+            found = minimize_scalar(
                 residual, bounds=between, method="bounded", options={"xatol": 0.2}
             )
-            longest = math.exp(best.x)
-        end = continued(lengths, longest)
+            longest = math.exp(found.x)
+        end = continued(lengths, longest, best())
     except StoppedError:
         return None
     model = copy.deepcopy(end.problem.friction)
-    found = result_from_shooting(model, end.problem, end.result, task.motions)
     return replace(
-        found, encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons
-    )
+        result_from_shooting(model, end.problem, end.result, task.motions),
+        encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons,
+    )  # fmt: skip
 
 
 @torch.no_grad()
