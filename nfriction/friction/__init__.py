@@ -134,7 +134,7 @@ def model_list(*, of_tables: bool = False) -> str:
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in kinds)
     besides = "" if of_tables else f", except {''.join(_MISSING)}"
     memory = f"{bristles}, gear, " + ("slip, load-slip" if of_tables else "maxwell-slip")
-    also = f"{bristles} and slip" if of_tables else bristles
+    also = "slip" if of_tables else bristles
     return (
         f"{laws}; also with {before} before them{besides}; with memory {memory}; neuro-fuzzy: may "
         f"precede {also}, too"

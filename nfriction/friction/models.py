@@ -196,7 +196,7 @@ class LFM(ConstantModel):
 
 
 class CFM(ConstantModel):
-    """Coulomb friction F_c alone: as of dry or lightly lubricated bearings."""
+    """Coulomb friction F_c alone, as in dry or lightly lubricated bearings."""
 
     definition = laws.COULOMB
 
