@@ -359,3 +359,14 @@ def test_figures_that_fail_leave_nothing_half_drawn(
         results.write_results(comparison, [recording], [], tmp_path)
     assert not list(tmp_path.rglob("*.png"))
     assert not list(tmp_path.glob(".*"))
+
+
+def test_the_info_of_a_model_takes_recordings_by_path(tmp_path) -> None:
+    time = 2e-3 * np.arange(500)
+    recording = Recording(time, 0.3 * np.cos(4.0 * time)[:, None], convention="relative,hanging")
+    recording.write(tmp_path / "run.csv")
+    plant = PendulumChain([0.2], [0.4])
+    settings = {"windows": (0.2,), "fit_plant": False, "max_steps": 1}
+    found = fit("viscous", plant, recording, **settings)
+    expected = results.model_info(found, Recording.read(tmp_path / "run.csv"))
+    assert results.model_info(found, tmp_path / "run.csv") == expected

@@ -91,6 +91,8 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
     else:
         assert found[0].name == name
         assert found[0].share > 0.5
+        if len(found) == 1:
+            assert found[0].share == pytest.approx(1 - (refitted.residual / law.residual) ** 2)
         assert "unexplained" in found[0].words(("a", "b"))
     if name == "position":
         torch.testing.assert_close(refitted.plant.load_waves, WAVES)
@@ -140,7 +142,8 @@ def test_dry_and_viscous_friction_differ_by_direction_in_their_own_ratios() -> N
 
 
 def test_the_fall_by_heat_is_recovered() -> None:
-    brief, true = {**BRIEF, "windows": (0.5, 1.0)}, truth("heat")
+    """Although it cools faster than a long window lasts."""
+    brief, true = {**BRIEF, "windows": (0.5, 3.0)}, truth("heat")
     recording = swing(pendulum(), true, seconds=6.0)
     law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **brief)
     model = NFCVFM(2, v_smooth=V_SMOOTH)

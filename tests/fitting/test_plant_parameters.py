@@ -6,7 +6,7 @@ import torch
 
 from nfriction import CVFM, LinearAxis, PendulumChain, Recording, Rotor, fit, rigs, rollout
 from nfriction.fitting.adjusted_plant import adjusted_buffers
-from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum
@@ -195,3 +195,9 @@ def test_links_in_a_horizontal_plane_have_no_weight_to_fit():
     names = [term.name for term in plant_parameters(plant, driven=[0, 1])]
     assert [n for n in names if n.startswith(("inertia", "gravity", "length", "angle"))] == [
         "inertia 11", "inertia 22", "gravity 2"]  # fmt: skip
+
+
+@pytest.mark.parametrize("term", [{"drag": True}, {"eccentricity": "on"}])
+def test_terms_of_a_plant_that_is_not_fitted_are_refused(term) -> None:
+    with pytest.raises(ValueError, match="terms of the plant, so they need `fit_plant=True`"):
+        FitOptions(fit_plant=False, **term)

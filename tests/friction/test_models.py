@@ -5,7 +5,7 @@ import re
 import pytest
 import torch
 
-from nfriction.friction import model_by_name, model_name, model_names, plain_name
+from nfriction.friction import model_by_name, model_list, model_name, model_names, plain_name
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import LINEAR, VISCOUS
 from nfriction.friction.models import LFM, NLFM, FrictionModel
@@ -295,3 +295,11 @@ def test_what_is_no_number_is_refused_by_name() -> None:
 def test_the_network_has_two_inputs(terms: object) -> None:
     with pytest.raises(ValueError, match="`terms` must be two whole numbers"):
         NFLFM(1, terms=terms)
+
+
+def test_models_are_offered_for_what_they_can_be_fitted_to() -> None:
+    of_motions, of_tables = (re.split(r"[ ,;()]+", model_list(of_tables=x)) for x in (False, True))
+    assert "maxwell-slip" in of_motions
+    assert not {"slip", "load-slip"} & set(of_motions)
+    assert {"slip", "load-slip"} <= set(of_tables)
+    assert not {"maxwell-slip", "adaptive:"} & set(of_tables)
