@@ -79,8 +79,8 @@ def fit(
             (`FitResult.encoder_offsets`), also for a recording to be scored. `"auto"`:
             `"per_recording"` if several recordings of a driven chain all begin at rest with every
             encoder at zero, with a warning.
-        start: an earlier fit to start from: of the same law for a neuro-fuzzy model; only the plant
-            terms are used from that of another model.
+        start: an earlier fit to start from: for a neuro-fuzzy model of its law, to the same
+            recordings; only the plant terms are used from that of another model.
         motions: smoothed motions in joint coordinates, to save smoothing again.
         max_steps: limit of steps at each window length.
         loss: `"linear"` for least squares, or a robust loss by SciPy's names, `"soft_l1"`,

@@ -76,7 +76,7 @@ class Windows:
         return torch.cat([self.q0, self.qd0], -1) if self.begin is None else self.begin
 
     def starting_at(self, states: Tensor) -> "Windows":
-        """The windows with searches from these states, (window, ...), unless they are known."""
+        """The same windows, searched from these states, (window, ...), unless they are known."""
         smoothed, known = torch.cat([self.q0, self.qd0], -1), list(self.at_rest)
         begin = states[:, : smoothed.shape[-1]].clone()
         begin[known] = smoothed[known]

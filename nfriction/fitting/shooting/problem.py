@@ -154,10 +154,7 @@ class ShootingProblem:
         return substepped(self.friction, self.substeps)
 
     def simulate(self, x: Tensor, *, with_hidden_states: bool = False) -> Trajectory:
-        """The windows' motion at `x`, valid until the next call.
-
-        Derivatives need the coefficients' hidden states along it, `with_hidden_states`.
-        """
+        """The windows' motion at `x`, valid until the next call; derivatives need hidden states."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
         model.schedule.set_parameter_vector(friction)

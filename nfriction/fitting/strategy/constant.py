@@ -214,6 +214,7 @@ def best_of_starts(
         return own.as_stopped()
     options, law = fitter.options, fitter.friction.law
     windows = nested.problem.windows.starting_at(nested.parts.states)
+    # Also as the mean of their prior, which its own stages move in the same way.
     q0, qd0 = windows.initial.chunk(2, -1)
     windows = replace(windows, q0=q0, qd0=qd0)
     same = windows.spans == own.problem.windows.spans

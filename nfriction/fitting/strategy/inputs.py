@@ -226,6 +226,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     def continued(
         windows: Sequence[float], cooling_time: float, end: HorizonResult | None
     ) -> HorizonResult:
+        """The last of searches over these windows, each from the end of the previous one."""
         fitter, options = widened_fitter(task, start, inputs, cooling_time), task.options
         friction = fitter.friction.schedule.parameter_vector()
         plant, noise = known_terms(start, fitter.jacobian.terms), options.first_noise
@@ -252,6 +253,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
         return min(ends, key=lambda end: end.rms, default=None)
 
     def residual(log_time: float) -> float:
+        """Residual over the shortest windows, once another search no longer reduces it."""
         end, before = best(), math.inf
         # Repeated, because a window starts with the heat of the friction that was found before.
         while end is None or before > task.options.network_gain * end.rms:

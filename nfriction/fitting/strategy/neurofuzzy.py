@@ -386,8 +386,8 @@ class Validation:
         assert law.plant_prior is not None
         self.law, self.motions, self.length, self.options = law, motions, length, law.options
         self.plant = law.plant_prior[0]
-        self.cut = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
-        self.residuals = start.residuals
+        self.smoothed = holdout.holdout_windows(law.recordings, motions, length, self.options.folds)
+        self.of_start = start.residuals
         # The noise that sets the weight of the priors is the residual of the constant law at the
         # same horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
@@ -401,11 +401,11 @@ class Validation:
     def windows(self) -> Windows:
         """Hold-out windows from the best states of the law, as smoothed ones may be far off."""
         values = self.law.friction.schedule.parameter_vector()
-        problem = self.law.problem(self.cut, self.noise, values)
+        problem = self.law.problem(self.smoothed, self.noise, values)
         x, stopped = settle_states(problem, problem.variables.start(self.plant))
         if stopped:
             raise holdout.StoppedError
-        return self.cut.starting_at(problem.variables.split(x).states)
+        return self.smoothed.starting_at(problem.variables.split(x).states)
 
     @cached_property
     def splits(self) -> list[tuple[Windows, Windows]]:
@@ -431,7 +431,7 @@ class Validation:
     @property
     def several(self) -> bool:
         """True if whole recordings can be held out."""
-        return len({place for place, *_ in self.cut.spans}) > 1
+        return len({place for place, *_ in self.smoothed.spans}) > 1
 
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The trial with the best prior; a wider plant prior is used only if clearly better."""
@@ -532,8 +532,8 @@ class Validation:
         if end.stopped or windows.spans == self.windows.spans:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
-        of_law = self.residuals.square()
-        # A law that was fitted to windows of other lengths.
+        of_law = self.of_start.square()
+        # The law may have been fitted to windows of other lengths.
         if of_law.shape != windows.q.shape:
             problem = self.law.problem(windows, self.noise, law)
             of_law = holdout.settled(windows, problem, law, self.plant)
