@@ -249,20 +249,29 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
     assert model.schedule.options()["prior_sd"] == 0.6
 
 
-def test_a_stop_while_inputs_are_chosen_keeps_the_network_accepted(constant, monkeypatch):
+@pytest.mark.parametrize("worse", ["", "Network rejected: it is worse."])
+def test_a_stop_while_inputs_are_chosen_keeps_the_verdict(constant, monkeypatch, worse):
     recording, law = constant
+    judged = []
 
     def stop(plain):
+        judged.append((plain.accepted, plain.squares))
         raise StoppedError
 
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy._with_chosen_inputs", stop)
+    monkeypatch.setattr(Validation, "lost_by", lambda self, end: worse)
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, **__: True)
     monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     model = NFLFM(1, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 2}
     found = fit(model, one_link(), recording, start=law, **settings)
     assert not found.converged
-    assert model.schedule.parameter_vector().any()
+    assert model.schedule.parameter_vector().any() == (not worse)
+    assert worse in found.status
+    # Inputs have to beat the network that is kept, or its law.
+    ((accepted, squares),) = judged
+    assert accepted == (not worse)
+    assert squares.isfinite().all()
 
 
 COUNT = 1e-5

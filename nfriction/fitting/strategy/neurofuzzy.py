@@ -1,11 +1,11 @@
 """Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
 
-First, the network is trained with fixed sets, and hold-out windows select the priors. Further
-inputs (`inputs`) are kept if the network improves on hold-out windows. Training continues with the
-residual noise, with the prior of each group of parameters set by evidence, and moves the sets
-if the evidence favours that; this is repeated with ever smaller noise as long as the hold-out
-windows improve. Every window is held out in turn, and a gain must exceed its scatter over windows.
-With several recordings, neither inputs nor the final network may be worse on hold-out recordings.
+First, the network is trained with fixed sets, and hold-out windows select the priors. Training
+continues with the residual noise, with the prior of each group of parameters set by evidence, and
+moves the sets if the evidence favours that; this is repeated with ever smaller noise as long as the
+hold-out windows improve. Every window is held out in turn, and a gain must exceed its scatter over
+windows. Further inputs (`inputs`) are kept if a network with them, trained alike, is better on
+hold-out windows. With several recordings, none may be worse on hold-out recordings.
 """
 
 import copy
@@ -98,8 +98,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
     except holdout.StoppedError:
-        if contest.best is not None:
-            contest.best = replace(contest.best, end=contest.best.end.as_stopped())
+        contest.stop()
     if chosen:
         cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     found = replace(
@@ -174,16 +173,13 @@ class _Contest:
         length = start.longest_usable_horizon(options.windows)
         self.validation = Validation(law, start, task.motions, length)
         self.best: Trial | None = None
-
-    def accepts(self, trial: "Trial") -> bool:
-        """True if the network beats the law on hold-out windows."""
-        least = self.task.options.network_gain
-        return gains(trial.squares, self.validation.of_law, least=least)
+        self.end: HorizonResult | None = None  # of the network fitted to all windows
+        self.rejected, self.stopped = INTERRUPTED, False
 
     @property
     def accepted(self) -> bool:
-        """True if the best network beats the law."""
-        return self.best is not None and self.accepts(self.best)
+        """True if the network beats the law."""
+        return not self.rejected
 
     @property
     def squares(self) -> Tensor:
@@ -194,41 +190,50 @@ class _Contest:
     @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network if it is accepted."""
-        assert self.best is not None
         if not self.accepted:
             return self.start
-        problem, parts = self.best.end.problem, self.best.end.parts
+        assert self.end is not None
+        problem, parts = self.end.problem, self.end.parts
         model, plant = model_at(problem.friction, parts.friction), problem.plant_at(parts.plant)
         return replace(self.start, model=model, plant=plant)
 
     def train(self) -> None:
-        """Find the best network; raises `StoppedError`."""
-        self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
+        """Find the best network, and reject it unless it beats the law; raises `StoppedError`."""
+        validation, before = self.validation, None
+        self.best = validation.best_trial(_with_narrowed_priors(self.free, self.start))
+        while self.best.finite and self.best is not before:
+            before, self.best = self.best, validation.trained_on(self.best)
+        self.rejected = self._compared()
+        if not self.rejected:
+            self.rejected = validation.lost_apart(self.best)
+        if not self.rejected:
+            self.end = validation.fit_all(self.best)
+            self.rejected = validation.lost_by(self.end)
+
+    def _compared(self) -> str:
+        """Reason to reject a network that does not beat the law on hold-out windows, or ""."""
+        assert self.best is not None
+        pair, least = (self.best.squares, self.validation.of_law), self.task.options.network_gain
+        return "" if gains(*pair, least=least) else holdout.verdict(*pair, least=least)
+
+    def stop(self) -> None:
+        """Keep the network as far as it is trained, after the caller stopped a search."""
+        self.stopped = True
+        if self.best is not None:
+            self.end = (self.end or self.best.end).as_stopped()
+            self.rejected = self._compared() if self.rejected == INTERRUPTED else self.rejected
 
     def result(self, model: FrictionModel) -> FitResult:
-        """The fully trained network, or its law, written into a model of the same kind."""
-        task, best, validation = self.task, self.best, self.validation
-        if best is None:
-            return self._kept(model, INTERRUPTED, converged=False)
-        before, note = None, ""
-        try:
-            while best.finite and best is not before:
-                before, best = best, validation.trained_on(best)
-            end = best.end
-            if self.accepts(best) and not end.stopped:
-                note = validation.lost_apart(best)
-                if not note:
-                    end = validation.fit_all(best)
-                    note = validation.lost_by(end)
-        except holdout.StoppedError:
-            end = best.end.as_stopped()
-        if not self.accepts(best):
-            least = task.options.network_gain
-            note = holdout.verdict(best.squares, validation.of_law, least=least)
-        if note:
-            return self._kept(model, note, converged=not end.stopped)
+        """The network, or its law if it is rejected, written into a model of the same kind."""
+        if self.rejected:
+            revert_to_constant(self.network, self.start, self.task.options)
+            model.load_state_dict(self.network.state_dict())
+            return constant_kept(self.start, model, self.rejected, converged=not self.stopped)
+        end, best = self.end, self.best
+        assert end is not None
+        assert best is not None
         found = copy.deepcopy(end.problem.friction)
-        result = result_from_shooting(found, end.problem, end.result, task.motions)
+        result = result_from_shooting(found, end.problem, end.result, self.task.motions)
         model.load_state_dict(found.state_dict())
         cast("NeuroFuzzy", model.schedule).prior_sd = best.prior_sd
         schedules = (cast("NeuroFuzzy", m.schedule) for m in (found, self.network))
@@ -240,11 +245,6 @@ class _Contest:
             status=result.status + moved,
             effective_parameters=effective_parameters(end),
         )
-
-    def _kept(self, model: FrictionModel, note: str, *, converged: bool) -> FitResult:
-        revert_to_constant(self.network, self.start, self.task.options)
-        model.load_state_dict(self.network.state_dict())
-        return constant_kept(self.start, model, note, converged=converged)
 
 
 def input_range(
