@@ -27,9 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = fit(model, pendulum, recording, windows=(0.5,), fit_plant=False, drag=False,
                 max_steps=steps)  # fmt: skip
     print(found.status)
-    for joint in rules_in_words(model, ["pendulum"]):
-        for rule in joint.rules:
-            print(f"{joint.joint}: {rule.sentence([('C_p', 'N m s/rad')])}")
+    # A rule that the recording hardly fired repeats its neighbours and the prior.
+    (joint,), (fired,) = rules_in_words(model, ["pendulum"]), found.rule_seconds()
+    for rule, duration in zip(joint.rules, fired, strict=True):
+        print(f"{rule.sentence([('C_p', 'N m s/rad')])} (fired for {duration:.2f} s)")
     before.schedule.set_range(model.schedule.velocity_range, [-80.0, 80.0])
     plots.memberships(model, before).savefig(arguments.out / "memberships.png", dpi=150)
     figure = plots.coefficient_surfaces(model, found.motions)

@@ -1,10 +1,10 @@
 """Train a model with constant coefficients on recordings, or as the RTIP paper did.
 
     python trainers/train_constant.py run1.csv run2.csv --rig rig.json --model NLFM
-    python trainers/train_constant.py --twin rtip --model NCFM --method sqp
-    python trainers/train_constant.py --twin rtip --model LFM --method pattern
+    python trainers/train_constant.py --twin rtip --model NCFM --method sqp --horizon 80
+    python trainers/train_constant.py --twin rtip --model LFM --method pattern --horizon 80
 
-The last two repeat the RTIP paper's estimation (80 s): NCFM by sequential quadratic programming,
+The last two repeat the RTIP paper's estimation over 80 s: NCFM by sequential quadratic programming,
 LFM and NLFM by pattern search on the simulated position. After Ctrl-C or a kill, `--resume`
 continues a pattern search from its last iteration; the other methods, which take seconds to
 minutes, start again. The result is that of an uninterrupted run.

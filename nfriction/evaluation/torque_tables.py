@@ -20,7 +20,7 @@ from nfriction.evaluation.results import RESULTS
 from nfriction.fitting import torque_table
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.recorded import ripple_shift
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import improves
 from nfriction.friction import model_by_name, model_name, plain_name
 from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, Recorded, unused
 from nfriction.friction.models import FrictionModel
@@ -434,7 +434,7 @@ def _cause(
         float(joint.tau.min() * joint.tau.max()) >= 0.0
         or (best == 2 and sizes[2] < 0.0)
         or float(np.square(found).mean()) <= small**2
-        or not gains(left[best], plain, chance)
+        or not improves(left[best], plain, chance)
     ):
         return "", np.zeros_like(error)
     ways, share = ("negative", "positive")[:: 1 if sizes[1] > 0 else -1], abs(sizes[1])
@@ -449,7 +449,7 @@ def _cause(
         "subtract inertia times acceleration.",
     )
     # In a narrow range of torques, an offset and a direction are alike.
-    alike = best < 2 and not gains(left[best], left[1 - best], chance)
+    alike = best < 2 and not improves(left[best], left[1 - best], chance)
     return texts[best] + f" Or, explaining as much: {texts[1 - best]}" * alike, found
 
 
@@ -510,7 +510,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
         more = by_need[need]
         best, reason = _simplest(more)
         new, old = (torch.tensor(c.errors).square() for c in (best, chosen))
-        if gains(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
+        if improves(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
             chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
             why += f"; {reason}" * (len(more) > 1)
         elif best.error < chosen.error:

@@ -23,7 +23,7 @@ from nfriction.fitting.data.inputs import names_of, weighs
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.result.paired_test import gains, jackknife_sd, student_quantile
+from nfriction.fitting.result.paired_test import improves, jackknife_sd, student_quantile
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
@@ -774,7 +774,7 @@ def changing_friction(
             sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
-            if abs(rate) > least and gains(growing, constant, options.drift_chance):
+            if abs(rate) > least and improves(growing, constant, options.drift_chance):
                 first, last = 1 - rate * mean, 1 + rate * (1 - mean)
                 ratio, slope = last / first, (1 - mean) / last + mean / first
                 sd *= ratio * slope * student_quantile(pieces - 1, 0.975)

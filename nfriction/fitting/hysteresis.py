@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import improves
 from nfriction.friction.hysteresis import DROP, ELEMENTS, FIRST, OFFSET, SATURATING, VISCOUS
 from nfriction.recording.torque_table import JointTorque
 
@@ -110,7 +110,8 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     squares = torch.tensor(left_out).square()
     best = squares[int(squares.sum(1).argmin())]
     # The simplest choice over which the best is no better than by chance.
-    chosen = next(k for k, own in enumerate(squares) if not gains(best, own, DEFAULTS.input_chance))
+    chance = DEFAULTS.input_chance
+    chosen = next(k for k, own in enumerate(squares) if not improves(best, own, chance))
     choice = choices[chosen]
     without = np.stack([fine.without(choice, fold) for fold in folds])
     # The merged elements, with the weights that suit them.

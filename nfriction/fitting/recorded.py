@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, fit_slip, range_of
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.result.paired_test import gains, student_quantile
+from nfriction.fitting.result.paired_test import improves, student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.hysteresis import TERMS, Recorded
 from nfriction.friction.neurofuzzy import PRIOR_SD
@@ -200,7 +200,7 @@ def ripple_shift(
 
     found = [squares(shift) for shift in shifts]
     best = min(range(SHIFTS), key=lambda k: float(found[k].sum()))
-    return float(shifts[best]) if gains(found[best], found[0], DEFAULTS.input_chance) else 0.0
+    return float(shifts[best]) if improves(found[best], found[0], DEFAULTS.input_chance) else 0.0
 
 
 class _Ripple(NamedTuple):

@@ -246,7 +246,7 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     for kept in (False, True):
         monkeypatch.setattr(
-            "nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, kept=kept, **__: kept
+            "nfriction.fitting.strategy.neurofuzzy.improves", lambda *_, kept=kept, **__: kept
         )
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)

@@ -9,7 +9,7 @@ import torch
 from nfriction import LFM, NFLFM, fit
 from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import improves
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
@@ -145,12 +145,12 @@ def test_a_network_that_diverges_errs_without_end(constant):
 def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
     law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
     network = law * torch.tensor(ratios, dtype=F64).square()
-    assert gains(network, law) is gained
+    assert improves(network, law) is gained
     # The less chance is left to scatter, the larger has a gain to be.
-    assert gains(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
-    assert gains(network, law, least=1.1) is (gained and max(ratios) < 1 / 1.1)
+    assert improves(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
+    assert improves(network, law, least=1.1) is (gained and max(ratios) < 1 / 1.1)
     # A law that diverges loses to what does not.
-    assert gains(law, torch.where(law > 3, torch.inf, law))
+    assert improves(law, torch.where(law > 3, torch.inf, law))
 
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):

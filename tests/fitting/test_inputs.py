@@ -28,9 +28,9 @@ from nfriction.fitting.strategy.inputs import (
     _of_shared,
     candidates,
     chosen_inputs,
-    drives,
-    placed,
+    friction_drives,
     widened_start,
+    with_position_load,
 )
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
@@ -187,7 +187,7 @@ class Contest:
         self.task, self.start, self.validation = task, start, self
         self.accepted = accepted
         self.of_law, self.final = of_law, error
-        self.of_law_apart = of_law if apart is None else apart
+        self.law_by_recording = of_law if apart is None else apart
         self.trained = False
 
     @property
@@ -242,7 +242,9 @@ def test_inputs_have_to_win_for_the_network_and_not_to_lose_for_its_law(
 
     monkeypatch.setattr(neurofuzzy.inputs, "chosen_inputs", lambda *given: (gains, *given[::-1]))
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
-    monkeypatch.setattr(neurofuzzy.inputs, "drives", lambda found, own: driving and own == 2)
+    monkeypatch.setattr(
+        neurofuzzy.inputs, "friction_drives", lambda found, own: driving and own == 2
+    )
     plain = Contest(task, "law")
     chosen, best = neurofuzzy._with_chosen_inputs(plain)
     (found,) = made
@@ -344,7 +346,7 @@ def test_a_constant_torque_is_no_friction_by_direction(viscous, by_direction, dr
     q = np.sin(9.0 * time)[:, None]
     motion = Motion(time, q, 9.0 * np.cos(9.0 * time)[:, None], -81.0 * q)
     found = SimpleNamespace(model=model, plant=Rotor(0.01), motions=(motion,))
-    assert drives(found, 2) is driving
+    assert friction_drives(found, 2) is driving
 
 
 @pytest.mark.parametrize("largest", [0.3, 0.5])
@@ -434,4 +436,4 @@ def test_waves_of_an_axis_fit_into_its_stroke() -> None:
     task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, [recording], FitOptions(**BRIEF))
     possible = 2 * math.pi * np.arange(1, 5) / np.ptp(q)
     nearest = min(possible, key=lambda one: abs(one - rate))
-    assert float(placed(task, law).plant.load_waves) == pytest.approx(nearest, rel=1e-3)
+    assert float(with_position_load(task, law).plant.load_waves) == pytest.approx(nearest, rel=1e-3)

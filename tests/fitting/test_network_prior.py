@@ -110,7 +110,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 4}
     law = fit(Stribeck(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, **__: True)
+        patch.setattr("nfriction.fitting.strategy.neurofuzzy.improves", lambda *_, **__: True)
         model = NFStribeck(1, v_smooth=V_SMOOTH, **SMALL)
         found = fit(model, one_link(), recording, start=law, **settings)
     assert found.model is model
@@ -259,8 +259,8 @@ def test_a_stop_while_inputs_are_chosen_keeps_the_verdict(constant, monkeypatch,
         raise StoppedError
 
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy._with_chosen_inputs", stop)
-    monkeypatch.setattr(Validation, "lost_by", lambda self, end: worse)
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, **__: True)
+    monkeypatch.setattr(Validation, "lost_over_long_windows", lambda self, end: worse)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.improves", lambda *_, **__: True)
     monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     model = NFLFM(1, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 2}

@@ -44,10 +44,10 @@ def fits(swings):
     law = fit(LFM(1), *swings, **options)
     with pytest.MonkeyPatch.context() as patch:
         # Nothing is left for a network to find here; it is to be kept all the same.
-        patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, **__: True)
+        patch.setattr("nfriction.fitting.strategy.neurofuzzy.improves", lambda *_, **__: True)
         patch.setattr(Validation, "trained_on", lambda self, trial: trial)
-        patch.setattr(Validation, "lost_by", lambda *_: "")
-        patch.setattr(Validation, "lost_apart", lambda *_: "")
+        patch.setattr(Validation, "lost_over_long_windows", lambda *_: "")
+        patch.setattr(Validation, "lost_by_recording", lambda *_: "")
         network = NFLFM(1, terms=(3, 2), head_units=2)
         return law, fit(network, *swings, start=law, **options)
 

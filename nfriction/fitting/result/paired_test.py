@@ -10,7 +10,7 @@ from torch import Tensor
 from nfriction.fitting.options import DEFAULTS
 
 
-def gains(
+def improves(
     new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance, least: float = 1.0
 ) -> bool:
     """True if squared errors on windows (window,) fell by more than their scatter would by chance.

@@ -66,7 +66,7 @@ def recording_splits(windows: Windows, folds: int) -> list[tuple[Windows, Window
 def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float = 1.0) -> str:
     """Sentence that rejects a network, from squared errors on each window, (window,).
 
-    `blocks` names the kind of data that was held out, `least` the required gain (see `gains`).
+    `blocks` names the kind of data that was held out, `least` the required gain (see `improves`).
     """
     ratio, spread = log_ratio(network, law)
     if math.isinf(ratio):

@@ -108,7 +108,7 @@ def _covered(task: FitTask) -> Tensor:
     return torch.outer(_wave_rates(task), visited) >= math.pi
 
 
-def placed(task: FitTask, start: FitResult) -> FitTask:
+def with_position_load(task: FitTask, start: FitResult) -> FitTask:
     """The task with the plant's load (1 + cos(k q + p)) / 2, for k and p favoured by the evidence.
 
     All waves and joints are fitted at once; then each joint keeps the wave that it needs most.
@@ -280,7 +280,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
 
 
 @torch.no_grad()
-def drives(found: FitResult, own: int) -> bool:
+def friction_drives(found: FitResult, own: int) -> bool:
     """True if coefficients beyond a law's own make friction drive a joint in one direction.
 
     A constant torque missing from the plant looks like friction that is larger in one direction.
@@ -310,7 +310,7 @@ def chosen_inputs(
     """
     names, at, longest = candidates(task), start, longest_duration(task.motions)
     # Load and position exclude each other, as a plant gives only one of them.
-    tasks = {"position": placed(task, start)} if "position" in names else {}
+    tasks = {"position": with_position_load(task, start)} if "position" in names else {}
     if "load" in names or not tasks:
         tasks["load"] = task
     chosen: list[InputGain] = []

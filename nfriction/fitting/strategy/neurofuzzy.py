@@ -26,7 +26,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import improves
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -82,7 +82,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     )
     aligned = replace(task, recordings=recordings, motions=motions)
     if "position" in given:
-        aligned = inputs.placed(aligned, start)
+        aligned = inputs.with_position_load(aligned, start)
     widened = inputs.widened_start(aligned, start, given) if widens else start
     if widened is None:
         fitter = inputs.widened_fitter(aligned, start, given, inputs.longest_duration(motions))
@@ -135,16 +135,16 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     new, old, chance = rival.validation, plain.validation, task.options.input_chance
     least = task.options.network_gain
     # An input may show only in the network: the law alone need not gain.
-    worse = gains(old.of_law, new.of_law, chance)
-    if worse or (new.several and gains(old.of_law_apart, new.of_law_apart, chance)):
+    worse = improves(old.of_law, new.of_law, chance)
+    if worse or (new.several and improves(old.law_by_recording, new.law_by_recording, chance)):
         return (), plain
     rival.train()
-    better = gains(rival.squares, plain.squares, least=least)
+    better = improves(rival.squares, plain.squares, least=least)
     # Windows between those of training show the same motion, so recordings have to confirm a law.
     if better and new.several and not rival.accepted:
-        better = gains(new.of_law_apart, old.of_law_apart, chance, least)
+        better = improves(new.law_by_recording, old.law_by_recording, chance, least)
     # Friction of the constant law may drive a joint even if that of its network does not.
-    drives = inputs.drives(rival.found, len(task.model.law.names))
+    drives = inputs.friction_drives(rival.found, len(task.model.law.names))
     return (chosen, rival) if better and not drives else ((), plain)
 
 
@@ -190,9 +190,8 @@ class _Contest:
     @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network if it is accepted."""
-        if not self.accepted:
+        if self.rejected or self.end is None:
             return self.start
-        assert self.end is not None
         problem, parts = self.end.problem, self.end.parts
         model, plant = model_at(problem.friction, parts.friction), problem.plant_at(parts.plant)
         return replace(self.start, model=model, plant=plant)
@@ -205,16 +204,16 @@ class _Contest:
             before, self.best = self.best, validation.trained_on(self.best)
         self.rejected = self._compared()
         if not self.rejected:
-            self.rejected = validation.lost_apart(self.best)
+            self.rejected = validation.lost_by_recording(self.best)
         if not self.rejected:
             self.end = validation.fit_all(self.best)
-            self.rejected = validation.lost_by(self.end)
+            self.rejected = validation.lost_over_long_windows(self.end)
 
     def _compared(self) -> str:
         """Reason to reject a network that does not beat the law on hold-out windows, or ""."""
         assert self.best is not None
         pair, least = (self.best.squares, self.validation.of_law), self.task.options.network_gain
-        return "" if gains(*pair, least=least) else holdout.verdict(*pair, least=least)
+        return "" if improves(*pair, least=least) else holdout.verdict(*pair, least=least)
 
     def stop(self) -> None:
         """Keep the network as far as it is trained, after the caller stopped a search."""
@@ -225,13 +224,11 @@ class _Contest:
 
     def result(self, model: FrictionModel) -> FitResult:
         """The network, or its law if it is rejected, written into a model of the same kind."""
-        if self.rejected:
+        end, best = self.end, self.best
+        if self.rejected or end is None or best is None:
             revert_to_constant(self.network, self.start, self.task.options)
             model.load_state_dict(self.network.state_dict())
             return constant_kept(self.start, model, self.rejected, converged=not self.stopped)
-        end, best = self.end, self.best
-        assert end is not None
-        assert best is not None
         found = copy.deepcopy(end.problem.friction)
         result = result_from_shooting(found, end.problem, end.result, self.task.motions)
         model.load_state_dict(found.state_dict())
@@ -418,9 +415,9 @@ class Validation:
         return self.judged(self.law_trial).squares
 
     @cached_property
-    def of_law_apart(self) -> Tensor:
+    def law_by_recording(self) -> Tensor:
         """Squared errors of the law on each window of hold-out recordings, (window,)."""
-        return self.apart(self.law_trial)
+        return self.by_recording(self.law_trial)
 
     @cached_property
     def law_trial(self) -> Trial:
@@ -448,7 +445,7 @@ class Validation:
                 trial = self.trial(under, zeros, "network, hold-out")
                 trials.append(replace(trial, prior_sd=sd))
             found = self.judged(min(trials, key=lambda trial: float(trial.squares.sum())))
-            if best is None or gains(found.squares, best.squares):
+            if best is None or improves(found.squares, best.squares):
                 best = found
         assert best is not None
         return best
@@ -472,9 +469,9 @@ class Validation:
         gained = log_evidence(moved.end) - log_evidence(held.end)
         better = moved if gained > self.options.evidence_gain else held
         judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
-        if gains(judged.squares, trial.squares):
+        if improves(judged.squares, trial.squares):
             return judged
-        return judged if explained and not gains(trial.squares, judged.squares) else trial
+        return judged if explained and not improves(trial.squares, judged.squares) else trial
 
     def _adapted(self, trial: Trial, noise: float, stride: int, *, learn_sets: bool) -> Trial:
         """A trial trained further, with the prior of each group tightened if evidence favours that.
@@ -510,18 +507,19 @@ class Validation:
         """The network of a trial, fitted to all windows."""
         return self._further(trial, self.windows, f"{self.length:g} s windows")
 
-    def lost_apart(self, trial: Trial) -> str:
+    def lost_by_recording(self, trial: Trial) -> str:
         """Reason to reject a network that is worse than its law on hold-out recordings, or "".
 
         Windows between those of training show the same motion, and hide that a network follows what
         is particular to a recording. A gain is not required, because there is less to train on.
         """
-        chance = self.options.input_chance
-        if not self.several or not gains(self.of_law_apart, apart := self.apart(trial), chance):
+        if not self.several:
             return ""
-        return holdout.verdict(apart, self.of_law_apart, "recordings")
+        law, found = self.law_by_recording, self.by_recording(trial)
+        lost = improves(law, found, self.options.input_chance)
+        return holdout.verdict(found, law, "recordings") if lost else ""
 
-    def lost_by(self, end: HorizonResult) -> str:
+    def lost_over_long_windows(self, end: HorizonResult) -> str:
         """Reason to reject a network that is worse than its law over the law's windows, or "".
 
         Hold-out windows are shorter, and insensitive to small torque errors.
@@ -564,7 +562,7 @@ class Validation:
             found.append(self._errors(end, test))
         return replace(trial, squares=torch.cat(found))
 
-    def apart(self, trial: Trial) -> Tensor:
+    def by_recording(self, trial: Trial) -> Tensor:
         """Squared errors of a trial on every window, from searches on other recordings."""
         splits = holdout.recording_splits(self.windows, self.options.folds)
         ends = (self._further(trial, train, "other recordings, hold-out") for train, _ in splits)

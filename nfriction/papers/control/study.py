@@ -95,7 +95,7 @@ _HIDDEN = Law(
 def true_friction(plant: PendulumChain) -> FrictionModel:
     """The friction of the simulated rig: the twin's, with the papers' load for bearing forces.
 
-    The force that a bearing carries, as used by the twin, is not an input of a friction model.
+    A friction model knows the force that a bearing carries only on a fixed pivot.
     """
     twin = replace(
         SPECIFICATIONS["rtip"].friction, seal=(8e-4,) * 3, bearing_arm=(5e-5,) * 3,

@@ -10,7 +10,7 @@ from nfriction.fitting.data.inputs import apply_encoder_offsets, require_motion
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import improves
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter
@@ -64,9 +64,9 @@ def fit_rbf(task: FitTask) -> FitResult:
         validation = Validation(law, start, motions, length)
         trial = validation.judged(validation.trial(fitter, base, "network, hold-out"))
         note = verdict(trial.squares, validation.of_law)
-        if gains(trial.squares, validation.of_law):
+        if improves(trial.squares, validation.of_law):
             end = validation.fit_all(trial)
-            note = validation.lost_by(end)
+            note = validation.lost_over_long_windows(end)
     except StoppedError:
         note = INTERRUPTED
     if end is None or note:

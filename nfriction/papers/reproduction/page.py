@@ -80,15 +80,16 @@ FIRST = (
          "Not shown in the paper. The controllers span the twin's coefficients by class.",
          figures={"networks_NFLFM": figures.network_surfaces}, models=("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
-         "Where a network did not pass its hold-out windows, its constant law is kept.",
+         "The law replaces a network that failed on hold-out windows; -papers: as in the paper.",
          figures={f"fig_{number}_coefficients_{name}": partial(figures.coefficients, name=name)
-                  for number, name in zip((11, 12, 13), NEURO_FUZZY, strict=True)},
-         models=NEURO_FUZZY),
+                  for names in (NEURO_FUZZY, tables.PAPERS_WAY)
+                  for number, name in zip((11, 12, 13), names, strict=True)},
+         models=(*NEURO_FUZZY, *tables.PAPERS_WAY)),
     Item("Fig. 14: measured and simulated position",
          "On a recording to which no model was fitted.",
          figures={f"fig_14_positions_{NEURO_FUZZY[-1]}":
-                  partial(figures.group_positions, models=NEURO_FUZZY[-1:],
-                          among=NEURO_FUZZY[-1:])}),
+                  partial(figures.group_positions, models=(NEURO_FUZZY[-1], tables.PAPERS_WAY[-1]),
+                          among=(NEURO_FUZZY[-1], tables.PAPERS_WAY[-1]))}),
     Item("Table 10: position error of every model",
          "The printed numbers cannot be reproduced, since the friction is from a different rig. "
          "-pattern: by the papers' pattern search; -papers: by their fuzzy controller and network. "

@@ -34,7 +34,7 @@ Callback = Callable[..., None]
 class Settings:
     """Everything that the results of a run depend on."""
 
-    seed: int = 0  # for the encoders' errors, the controllers' samples and the searches
+    seed: int = 0  # for the encoders' errors and the searches
     tlrip_seconds: float = 40.0  # duration of each twin's recordings; 40 and 80 in the papers
     rtip_seconds: float = 80.0
     windows: tuple[float, ...] = (0.5, 2.0)  # lengths of the fits' windows [s]

@@ -61,9 +61,10 @@ def test_a_network_with_jerk_beats_the_law_that_it_starts_from(case: Case) -> No
 def test_a_network_that_gains_nothing_is_its_law(
     case: Case, lost: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nfriction.papers.nffem.fit_rbf.gains", lambda *_: lost != "hold-out")
+    monkeypatch.setattr("nfriction.papers.nffem.fit_rbf.improves", lambda *_: lost != "hold-out")
     monkeypatch.setattr(
-        "nfriction.papers.nffem.fit_rbf.Validation.lost_by", lambda *_: "Network rejected: kept."
+        "nfriction.papers.nffem.fit_rbf.Validation.lost_over_long_windows",
+        lambda *_: "Network rejected: kept.",
     )
     found = network(case, 1)
     assert "Network rejected" in found.status
