@@ -173,6 +173,8 @@ class FitOptions:
     # Log ratio of evidences that is substantial: half the logarithm of 10 (H. Jeffreys, Theory of
     # Probability, 3rd ed. 1961, appendix B).
     evidence_gain: float = 0.5 * math.log(10.0)
+    # The same for an input of friction: decisive, as the law depends on it wherever it is used.
+    input_evidence: float = 2.0 * math.log(10.0)
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

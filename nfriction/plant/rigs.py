@@ -285,11 +285,12 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
     kind = data.get("kind", "chain")
     if not isinstance(kind, str) or kind not in _KINDS:
         raise ValueError(f"rig: no kind {reprlib.repr(kind)}; there are {sorted(_KINDS)}.")
+    plant = _KINDS[kind]
     for key, value in data.items():
-        if key not in _TEXTS:
+        if key in (*plant.required, *plant.optional, "buffers") and key not in _TEXTS:
             _check_numbers(key, value)
     try:
-        return _KINDS[kind].from_dict(data)
+        return plant.from_dict(data)
     except RuntimeError as error:  # torch, of shapes that do not fit
         raise ValueError(f"its values do not fit together ({str(error)[:300]}).") from error
 

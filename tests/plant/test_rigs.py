@@ -111,6 +111,7 @@ def write(path: Path, text: str) -> Path:
     [
         ('{"mass": [1]}', r"missing keys \['length'\]"),
         ('{"mass": [1], "length": [1], "masss": 2}', r"unknown keys \['masss'\]"),
+        ('{"mass": [1], "length": [1], "type": "chain"}', r"unknown keys \['type'\]"),
         ('{"mass": [1], "length": [1], "arm": {"inertia": 1}}', r"arm: missing keys \['length'\]"),
         ('{"mass": [1], "length": ["long"]}', "`length` must be"),
         ('{"mass": 1, "length": [1]}', "`mass` must be one or more numbers"),

@@ -320,7 +320,7 @@ def chosen_inputs(
         for kind, one in tasks.items():
             tried = {n: INPUTS[n].name for n in names if n == kind or n not in ("load", "position")}
             choice = _Choice.of(widened_fitter(one, start, [*tried], longest, at), one, at, tried)
-            best = choice.best(held, task.options.evidence_gain) if choice else None
+            best = choice.best(held, task.options.input_evidence) if choice else None
             found += [(*best, kind)] if best else []
         if not found:
             return tuple(chosen), at, seeing

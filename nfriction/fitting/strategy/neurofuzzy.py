@@ -140,9 +140,6 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
         return (), plain
     rival.train()
     better = improves(rival.squares, plain.squares, least=least)
-    # Windows between those of training show the same motion, so recordings have to confirm a law.
-    if better and new.several and not rival.accepted:
-        better = improves(new.law_by_recording, old.law_by_recording, chance, least)
     # Friction of the constant law may drive a joint even if that of its network does not.
     drives = inputs.friction_drives(rival.found, len(task.model.law.names))
     return (chosen, rival) if better and not drives else ((), plain)
