@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import torch
 
 from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
@@ -21,6 +22,7 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.paired_test import improves
 from nfriction.friction import model_by_name, model_name
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -128,9 +130,7 @@ def select(
     block of every recording out, fits all models to the rest and simulates the hold-out blocks; if
     encoders were zeroed at the start of each recording, with the offsets estimated from the rest. A
     model with fewer parameters is preferred if its error is statistically tied with the smallest
-    one: within 2 %, or within the standard error of the difference over blocks, both in mean square
-    and in logarithm, because one block of violent motion must not hide that the model is worse on
-    all others.
+    one: within 2 %, or within the scatter over blocks (`improves`).
 
     Args:
         plant, models, progress, jobs, fit_settings: as in `compare`.
@@ -265,12 +265,6 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
 
 def indistinguishable(one: Candidate, best: Candidate) -> bool:
     """True if two errors differ by no more than their scatter over the blocks explains."""
-    if not math.isfinite(one.error):
-        return False
-    if one.error <= (1 + TOLERANCE) * best.error:
-        return True
-    squares = np.square([one.errors, best.errors])
-    logarithms = np.log(squares.clip(min=DEFAULTS.min_noise**2))
-    differences, n = (np.subtract(*squares), np.subtract(*logarithms)), len(one.errors)
-    # The mean difference is within its standard error.
-    return all(d.mean() <= (d.std(ddof=1) / math.sqrt(n) if n > 1 else 0.0) for d in differences)
+    squares = np.square([best.errors, one.errors]).clip(min=DEFAULTS.min_noise**2)
+    new, old = torch.from_numpy(squares)
+    return not improves(new, old, least=1 + TOLERANCE)

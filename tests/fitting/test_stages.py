@@ -12,7 +12,7 @@ from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import information, standard_deviations
-from nfriction.fitting.result.paired_test import log_ratio
+from nfriction.fitting.result.paired_test import improves, mean_gain
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy import continuation
 from nfriction.fitting.strategy.continuation import (
@@ -173,13 +173,21 @@ def test_states_settle_while_the_parameters_stay():
     assert problem.cost(settled) < problem.cost(start)
 
 
-def test_a_ratio_of_errors_is_known_as_well_as_its_windows_agree():
+def test_a_gain_is_known_as_well_as_its_windows_agree():
     old = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=F64)
-    ratio, spread = log_ratio(4.0 * old, old)
-    assert ratio == pytest.approx(math.log(2.0))
-    assert spread == pytest.approx(0.0, abs=1e-12)
-    assert log_ratio(torch.tensor([9.0, 2.0, 3.0, 4.0]), old)[1] > 0.1
-    assert log_ratio(old[:1], old[:1]) == (0.0, math.inf)
+    assert mean_gain(4.0 * old, old) == pytest.approx((-0.6, 0.0), abs=1e-12)
+    assert mean_gain(torch.tensor([9.0, 2.0, 3.0, 4.0]), old) == pytest.approx((-0.2, 0.2))
+    assert mean_gain(old[:1], old[:1]) == (0.0, math.inf)
+    assert mean_gain(torch.zeros(2), torch.zeros(2)) == (0.0, 0.0)
+    assert mean_gain(torch.tensor([math.inf, 1.0]), torch.ones(2))[0] == -0.5
+
+
+def test_one_lively_window_does_not_outweigh_many_others():
+    old, new = torch.tensor([100.0, *[1.0] * 9]), torch.tensor([50.0, *[1.3] * 9])
+    assert float(new.sum()) < float(old.sum())
+    assert not improves(new, old)
+    assert improves(0.8 * old, old)
+    assert not improves(0.8 * old, old, least=1.2)
 
 
 @pytest.mark.parametrize(("scatter", "lost"), [(0.3, False), (0.01, True)])

@@ -15,31 +15,28 @@ def improves(
 ) -> bool:
     """True if squared errors on windows (window,) fell by more than their scatter would by chance.
 
-    Uses Student's distribution, because there may be few windows. The ratio of the old to the new
-    root mean square must be above `least`.
+    The mean gain must differ from zero by Student's test, because there may be few windows. The
+    ratio of the old to the new root mean square must be above `least`.
     """
     if not old.isfinite().all():
         return bool(new.isfinite().all())
-    ratio, spread = log_ratio(new, old)
-    by_chance = spread * student_quantile(len(new) - 1, 1 - chance)
-    return ratio + max(by_chance, math.log(least)) < 0
+    gain, spread = mean_gain(new, old)
+    sure = gain > spread * student_quantile(len(new) - 1, 1 - chance)
+    return sure and float(old.sum()) > least**2 * float(new.sum())
 
 
-def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
-    """Log of the ratio of two sums over windows (window,), and its standard deviation.
+def mean_gain(new: Tensor, old: Tensor) -> tuple[float, float]:
+    """Mean over windows (window,) of (old - new) / (old + new), and its standard error.
 
-    Jackknife over the windows, because residuals are correlated within and not across them;
-    infinite for a single window.
-
-    References:
-        B. Efron, C. Stein, Annals of Statistics 9 (1981), 586-596.
+    That is half the logarithm of the ratio of squares if this is small. It is bounded, since a few
+    windows of lively motion would outweigh all others in a sum of squares. The error is infinite
+    for a single window.
     """
-    count = len(new)
-    ratio = 0.5 * float(torch.log(new.sum() / old.sum()))
-    if count < 2:
-        return ratio, math.inf
-    without = 0.5 * torch.log((new.sum() - new) / (old.sum() - old))
-    return ratio, jackknife_sd(without.tolist())
+    both = old + new
+    gains = torch.where(both > 0, 2 * old / both - 1, torch.zeros_like(both))
+    freedom = len(gains) - 1
+    spread = math.sqrt(float(gains.var(correction=0)) / freedom) if freedom else math.inf
+    return float(gains.mean()), spread
 
 
 def jackknife_sd(without: Sequence[float]) -> float:

@@ -18,7 +18,7 @@ from nfriction.fitting.result.identifiability import (
     information,
     standard_deviations,
 )
-from nfriction.fitting.result.paired_test import log_ratio, student_quantile
+from nfriction.fitting.result.paired_test import mean_gain, student_quantile
 from nfriction.fitting.shooting.autocorrelation import (
     bandwidth,
     effective_noise,
@@ -344,15 +344,14 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     free swings without limit, but errors of a measured torque accumulate over a long window and
     bias its parameters. Even with a correct law and plant, torque noise accumulates, so longer
     windows may determine friction less well (`knows_less`). As the noise of each horizon is
-    unknown, its log likelihood uses the RMS residual; a stage loses if its parameters are worse at
-    a shorter horizon by more than its noise, and over all horizons by more than that of the sum.
+    unknown, errors are compared window by window; a stage loses if its parameters are worse at a
+    shorter horizon by more than the scatter, and over all horizons by more than that of the sum.
     """
     from scipy.special import chdtri  # slow to import
 
     before, chance = stages[-1], found.problem.options.loss_level
     lower, upper = found.problem.variables.bounds()
     fitted = int((lower < upper)[: found.problem.variables.shared_count].sum())
-    driven = bool(found.problem.windows.tau.any())
     if knows_less(found, before):
         return True
     total, variance, worse = 0.0, 0.0, False
@@ -362,16 +361,14 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
             lost = float(new.sum() - at.residuals.square().sum()) / at.noise**2
             if not lost <= float(chdtri(fitted, chance)):
                 return True
-            continue
-        if not driven:
-            continue
-        old = _squares(at, before)
-        ratio, spread = log_ratio(new, old)
-        total += ratio
-        # A single window has no scatter.
-        variance += spread**2 if math.isfinite(spread) else 0.0
-        worse |= at is not found and ratio > spread * student_quantile(len(new) - 1, 1 - chance)
-    return worse and not total <= math.sqrt(variance) * NORMAL_95
+        elif found.problem.windows.tau.any():
+            gain, spread = mean_gain(new, _squares(at, before))
+            total += gain
+            # A single window has no scatter.
+            variance += spread**2 if math.isfinite(spread) else 0.0
+            sure = spread * student_quantile(len(new) - 1, 1 - chance)
+            worse |= at is not found and -gain > sure
+    return worse and total < -math.sqrt(variance) * NORMAL_95
 
 
 def knows_less(found: HorizonResult, before: HorizonResult) -> bool:

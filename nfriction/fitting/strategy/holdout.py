@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows, moving_segments
-from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.fitting.strategy.continuation import settle_states
@@ -68,15 +67,15 @@ def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float 
 
     `blocks` names the kind of data that was held out, `least` the required gain (see `improves`).
     """
-    ratio, spread = log_ratio(network, law)
-    if math.isinf(ratio):
+    change = 100 * (math.sqrt(float(network.sum() / law.sum())) - 1)
+    if math.isinf(change):
         return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
-    change = 100 * math.expm1(ratio)
+    better = int((network < law).sum())
     gain = f" ({100 * (least - 1):.0f} % and more than the scatter are required)"
     return (
-        f"Network rejected: on hold-out {blocks} it was {abs(change):.3g} % "
-        f"{'worse' if change > 0 else 'better'} than its constant law, with a standard error of "
-        f"{100 * spread:.2g} %{'' if change > 0 else gain}; the constant law is kept."
+        f"Network rejected: its error on hold-out {blocks} was {abs(change):.3g} % "
+        f"{'more' if change > 0 else 'less'} than that of its constant law, and lower on {better} "
+        f"of {len(law)}{'' if change > 0 else gain}; the constant law is kept."
     )
 
 
