@@ -104,6 +104,9 @@ def mistakes() -> Iterator[Mistake]:
     yield Mistake(
         "time in ms as s", "unit of its time|in ms", lambda r: r._replace(time=1e3 * r.time)
     )
+    for free in (False, True):
+        name = f"500 Hz taken for 250, {'free' if free else 'driven'}"
+        yield Mistake(name, "sample rate is", lambda r: r._replace(time=2 * r.time), free=free)
     yield Mistake("torque constant 15 % off", "times those of the rig", scaled(tau=both(1.15)))
     yield Mistake("motor's angle as the joint's (1:5)", "too large|gear ratio",
                   scaled(q=both(5.0)))  # fmt: skip

@@ -298,6 +298,7 @@ def _tested(
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
         if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
             yield from _elastic(plant, given, recordings[0].sample_time)
+    yield _wrong_rate(plant, given)
     for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)
 
@@ -477,7 +478,6 @@ def _corrected_positions(
     yield "the signs of all positions are reversed", recorded(-eye)
     for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
         yield f"positions are in {unit}", recorded(factor * eye)
-    yield "time is in ms", replace(given, qd=given.qd * 1e3, qdd=given.qdd * 1e6)
     yield "time runs backwards: the motion gains energy", replace(given, qd=-given.qd)
     if chain:
         zero: MeasuredFrom = "hanging" if convention.measured_from == "upright" else "upright"
@@ -982,6 +982,18 @@ def _drifting_clock(
     fast = "faster" if drift > 0 else "slower"
     off = f"{100 * abs(drift):.2g} % {fast}"
     return f"the clock of the torques is {off} than that of the positions", share
+
+
+def _wrong_rate(plant: Plant, given: _Data) -> tuple[str, float]:
+    """The factor on the sample rate that explains most, and the unexplained share [-]."""
+
+    def left(x: float) -> float:
+        rate = math.exp(x)
+        return _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+
+    most = math.log(10)
+    x, share = _best(left, -most, most, 17)
+    return f"the sample rate is {math.exp(x):.3g} times that of `time`", share
 
 
 def _best(

@@ -511,6 +511,13 @@ def test_mistakes_in_conventions_and_time(name):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
 
+@pytest.mark.parametrize("name", ["free", pytest.param("driven", marks=pytest.mark.slow)])
+def test_a_wrong_sample_rate_is_named(name):
+    plant, q, tau = measured(name)
+    (text,) = warnings_of(plant, q, tau, time=2.5 * STEP * np.arange(len(q)))
+    assert "likely: the sample rate is 2.5 times that of `time`" in text
+
+
 @pytest.mark.parametrize("rate", [20.0, 500.0, 4000.0, 10000.0])
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_the_unit_of_times_is_that_of_a_usual_rate(rate, unit, factor):
