@@ -2,16 +2,20 @@
 
     python trainers/train_supervised.py
     python trainers/train_supervised.py --adaptive runs/papers/models/ANLFM.json --units 12
+    python trainers/train_supervised.py --noise 0.1 --every 10
 
 The data set is `tlrip_controller`: 40,000 samples per joint of velocity, acceleration and the
 outputs of the papers' own controllers, coefficients B and C of the linear law. With `--adaptive`,
 the controllers are instead spanned by the coefficients by class of an adaptive model of any law,
-along the same motion. Writes the model with its TorchScript, a figure of the loss by step and one
-of the learnt outputs. A run takes about a minute; after an interruption it starts again.
+along the same motion. `--noise` adds noise to the outputs that the networks learn, and `--every`
+thins the samples; errors are those on all samples without noise. Writes the model with its
+TorchScript, a figure of the loss by step and one of the learnt outputs. A run takes about a minute;
+after an interruption it starts again.
 """
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import common
@@ -50,7 +54,14 @@ def train(argv: Sequence[str] | None) -> str:
         "--starts", type=int, default=1, help="number of starts; the best by evidence is kept"
     )
     parser.add_argument("--seconds", type=positive, help="duration of the motion; default 40 s")
-    parser.add_argument("--seed", type=int, default=0, help="of encoders and starts")
+    parser.add_argument(
+        "--noise", type=positive, default=0.0,
+        help="standard deviation of noise on the outputs, as a share of their range",
+    )  # fmt: skip
+    parser.add_argument(
+        "--every", type=common.natural, default=1, help="train on one of this many samples"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of encoders, noise and starts")
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
     law, controllers, samples = _data(given)
@@ -58,7 +69,9 @@ def train(argv: Sequence[str] | None) -> str:
     options = TrainingOptions(
         max_steps=given.max_steps, seed=given.seed, starts=given.starts, callback=keep
     )
-    model, fits = train_on_samples(law, controllers, samples, units=given.units, options=options)
+    span = samples.y.amax(0) - samples.y.amin(0)
+    taught = _taught(samples, given.noise * span, given)
+    model, fits = train_on_samples(law, controllers, taught, units=given.units, options=options)
     ended = [f"{n}: {f.message}" for n, f in zip(samples.joint_names, fits, strict=True)]
     converged = all(f.converged for f in fits)
     fastest, (braking, driving) = samples.x[..., 0].amax(0), samples.x[..., 1].aminmax(dim=0)
@@ -71,12 +84,11 @@ def train(argv: Sequence[str] | None) -> str:
     path = save(model, given.out / f"{type(model).__name__}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     learnt = model.schedule(samples.x[..., 0], samples.x[..., 1])
-    span = samples.y.amax(0) - samples.y.amin(0)
     error = (learnt - samples.y).square().mean(0).sqrt() / span
     common.draw_losses(losses, given.out / f"{path.stem}-loss.png")
     _outputs(law, samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
     lines = [
-        f"{path.stem}: {len(samples)} samples per joint, {given.units} units",
+        f"{path.stem}: {len(taught)} samples per joint, {given.units} units",
         *ended,
         *(
             f"{joint}: error of the network [% of the output's range] "
@@ -111,6 +123,16 @@ def _data(
     )
     again = sampled(controllers, motion, joint_names=samples.joint_names)
     return adaptive.law, controllers, again
+
+
+def _taught(
+    samples: ControllerSamples, noise: torch.Tensor, given: argparse.Namespace
+) -> ControllerSamples:
+    """The samples to train on, with noise of a standard deviation for each joint and output."""
+    draw = torch.Generator().manual_seed(given.seed)
+    y = samples.y + noise * torch.randn(samples.y.shape, dtype=noise.dtype, generator=draw)
+    part = slice(None, None, given.every)
+    return replace(samples, time=samples.time[part], x=samples.x[part], y=y[part])
 
 
 def _outputs(law: Law, samples: ControllerSamples, learnt: torch.Tensor) -> Figure:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 import runpy
 import signal
 import subprocess
@@ -125,6 +126,24 @@ def test_networks_are_trained_on_the_supervised_set(
     assert adaptive is not None or (spread > 0).all()
     for name in (f"{made}.pt", f"{made}-loss.png", f"{made}-outputs.png"):
         assert (tmp_path / name).stat().st_size > 0
+
+
+def test_networks_tolerate_noise_on_what_they_learn(
+    tmp_path: Path,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("nfriction.datasets.cache_folder", lambda: cache)
+    words = ["--seconds", "3", "--every", "2", "--units", "6", "--max-steps", "10"]
+    worst = {}
+    for noise in ("0.001", "0.5"):
+        train("train_supervised.py", *words, "--noise", noise, "--out", str(tmp_path))
+        printed = capsys.readouterr().out
+        assert "1500 samples per joint" in printed
+        worst[noise] = max(map(float, re.findall(r"\b[BC] ([\d.]+)", printed)))
+    # In % of the outputs' range: noise matters, but most of its 50 % is averaged out.
+    assert worst["0.001"] < 1.0 < worst["0.5"] < 10.0
 
 
 @pytest.mark.slow
