@@ -175,19 +175,20 @@ BEFORE = {
         cp table.csv other_table.csv""",
 }
 # Pages that build on each other run in one folder.
-QUICK = {"which_law.md"}
+QUICK = {"which_law.md", "from_the_papers.md"}
 SESSIONS = [
     pytest.param(pages.split(), marks=[] if pages in QUICK else pytest.mark.slow, id=pages)
     for pages in (
         "which_law.md", "own_rules.md", "own_law.md", "explanation.md", "tour.md",
         "motor.md compensation.md", "own_rig.md export.md", "torque_table.md", "README.md",
+        "from_the_papers.md",
     )
 ]  # fmt: skip
 # They need a robot file of the reader's, a network, make, or minutes that another test takes.
 NOT_RUN = (
     'rig = rigs.read("robot.urdf")', "nfriction: error: arm.urdf", "nfriction data get",
     "cd data/", "make demo", "Without friction, simulations of the test",
-    "recording, signals", "pip install",
+    "recording, signals", "pip install", " encoder ──▶",
 )  # fmt: skip
 
 

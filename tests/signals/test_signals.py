@@ -421,6 +421,23 @@ def test_frequency_counting_resolves_a_count_over_its_interval(interval: float) 
     assert np.abs(timed - speed).max() < 0.1 * np.abs(found - speed).max()
 
 
+@pytest.mark.parametrize("times", [0.2, 0.7, 1.4, 10.0])
+def test_period_counting_is_better_below_the_speed_of_equal_resolution(times: float) -> None:
+    """Their resolutions, counts per interval and v² sample / count, are equal at one speed."""
+    time, sample, interval = np.arange(8000) / 1000, 1e-3, 0.01
+    # One speed alone may fit a whole number of counts into the interval.
+    speeds = times * QUANTUM / math.sqrt(sample * interval) * np.linspace(0.8, 1.2, 81)
+    q = time[:, None] * speeds
+    by_edges = period_counting(time, q, COUNTS)
+    by_counts = frequency_counting(time, q, COUNTS, interval=interval)
+    edges, counts = (np.std((v - speeds)[1000:]) for v in (by_edges, by_counts))
+    # A resolution r, rounded up or down in a random share of samples: r / sqrt(6).
+    assert counts == pytest.approx(QUANTUM / interval / math.sqrt(6), rel=0.2)
+    timed = min(times**2 * QUANTUM / interval, QUANTUM / sample) / math.sqrt(6)
+    assert edges == pytest.approx(timed, rel=0.1)
+    assert (edges < counts) == (times < 1)
+
+
 def test_frequency_counting_starts_at_zero_and_needs_an_interval() -> None:
     time = np.arange(100) / 1000
     found = frequency_counting(time, 10.0 * time[:, None], COUNTS)
