@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.plant import Arm, LinearAxis, PendulumChain, rigs
+from nfriction.plant import Arm, LinearAxis, Motor, PendulumChain, rigs
 
 
 @pytest.mark.filterwarnings("error")
@@ -218,3 +218,18 @@ def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
     for wrong in (None, [1.0], "rig"):
         with pytest.raises(ValueError, match="a rig is one table"):
             rigs.from_dict(wrong)  # type: ignore[arg-type]
+
+
+def test_a_geared_motor_adds_its_reflected_inertia_to_the_arm_alone() -> None:
+    """As in `datasets/rtip_twin`: the RTIP paper's gearbox of 10:1, a hundred times the rotor."""
+    plain = rigs.rtip("free")
+    free = plain.to_dict()
+    links = {key: free[key] for key in ("mass", "length", "com", "inertia", "gravity")}
+    motor = Motor(gear_ratio=[10, 1, 1, 1], rotor_inertia=[1e-5, 0, 0, 0])
+    geared = PendulumChain(**links, arm=Arm(**free["arm"]), motor=motor)
+    q, qd = torch.randn(2, 5, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    expected = torch.zeros(5, 4, 4, dtype=torch.float64)
+    expected[:, 0, 0] = 1e-3
+    added = geared.mass_matrix(q) - plain.mass_matrix(q)
+    torch.testing.assert_close(added, expected, rtol=0, atol=1e-14)
+    assert torch.equal(geared.bias(q, qd), plain.bias(q, qd))
