@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import runpy
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import torch
 FOLDER = Path(__file__).resolve().parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.glob("*.py"))
 # The package itself, and subpackages whose `__all__` is public.
-PUBLIC = {"friction", "fuzzy", "fitting", "papers", "report", "signals"}
+PUBLIC = {"friction", "fuzzy", "fitting", "papers", "report", "signals", "simulation"}
 
 # What the last lines of each must say, so that a silent failure is none.
 SAID = {
     "export_to_c": "selftest",
+    "feedforward": "compensated: the true one",
     "fit_a_recording": "best: ",
     "fuzzy_rules": "in % of range",
     "many_fits_on_dask": "fitted on 2 workers",
@@ -23,8 +25,30 @@ SAID = {
     "neuro_fuzzy": "THEN C_p = ",
     "own_law": "true 0.0004",
     "own_rig": "fitted B, C:",
+    "rtip_table_4": "NLFM, printed",
 }
 
+
+def compensation_reduces_the_error(printed: str) -> bool:
+    """A better model of the friction leaves a smaller tracking error, and the true one least."""
+    errors = [float(x) for x in re.findall(r"tracking error +([\d.]+) mrad", printed)]
+    none, *learnt, true = errors
+    return errors == sorted(errors, reverse=True) and max(learnt) < 0.1 * none and true > 0
+
+
+def five_coefficients_are_best(printed: str) -> bool:
+    """The RTIP paper's claim holds on either recording, for the sum over the joints."""
+    rows = re.findall(r"^(\w+), (\w+) +([\d.]+) +([\d.]+) +([\d.]+)$", printed, re.MULTILINE)
+    total = {(model, kind): sum(map(float, joints)) for model, kind, *joints in rows}
+    kinds = ("fitted", "test", "printed")
+    return all(total["NLFM", k] < min(total["NCFM", k], total["LFM", k]) for k in kinds)
+
+
+# What more the printed numbers must satisfy.
+LAWS = {
+    "feedforward": compensation_reduces_the_error,
+    "rtip_table_4": five_coefficients_are_best,
+}
 
 # What some need beyond the package.
 NEEDS = {"many_fits_on_dask": ("dask", "distributed", "joblib")}
@@ -35,7 +59,7 @@ def test_every_example_is_known() -> None:
 
 
 # A cluster's processes load the whole package first; networks train for seconds.
-SLOW = {"many_fits_on_dask", "neuro_fuzzy"}
+SLOW = {"feedforward", "many_fits_on_dask", "neuro_fuzzy"}
 RUNS = [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW))
         for path in EXAMPLES]  # fmt: skip
 
@@ -50,6 +74,7 @@ def test_runs_quickly(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     printed = capsys.readouterr().out.replace("self-test", "selftest")
     assert SAID[path.stem] in printed
     assert "nan" not in printed
+    assert path.stem not in LAWS or LAWS[path.stem](printed)
     assert list((tmp_path / "out").rglob("*.*"))
 
 
