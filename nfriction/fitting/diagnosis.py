@@ -169,6 +169,7 @@ def likely_mistakes(
     least = min((share for _, share in tested), default=math.inf)
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
+    rare.append(_wrong_rate(plant, given))
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
@@ -298,7 +299,6 @@ def _tested(
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
         if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
             yield from _elastic(plant, given, recordings[0].sample_time)
-    yield _wrong_rate(plant, given)
     for text, rig in _missing_rotors(plant, given, options):
         yield text, _unexplained(rig, given)
 
