@@ -509,7 +509,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     for need in others:
         more = by_need[need]
         best, reason = _simplest(more)
-        new, old = (torch.tensor(c.errors).square() for c in (best, chosen))
+        new, old = torch.from_numpy(np.square([best.errors, chosen.errors]))
         if improves(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
             chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
             why += f"; {reason}" * (len(more) > 1)

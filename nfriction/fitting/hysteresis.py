@@ -107,7 +107,7 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     folds = fine.folds(blocks)
     choices = [fine.best(shape) for shape in _Shape.every()]
     left_out = [fine.left_out(choice, folds) for choice in choices]
-    squares = torch.tensor(left_out).square()
+    squares = torch.from_numpy(np.square(left_out))
     best = squares[int(squares.sum(1).argmin())]
     # The simplest choice over which the best is no better than by chance.
     chance = DEFAULTS.input_chance

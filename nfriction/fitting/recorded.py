@@ -196,7 +196,7 @@ def ripple_shift(
         moved = inputs | {"position": inputs["position"] + shift}
         change = schedule.corrected(still, moved) - schedule.corrected(still, inputs)
         error = joint.tau - torque - change.numpy()[:, 0]
-        return torch.tensor([float(error[block] @ error[block]) for block in blocks])
+        return torch.from_numpy(np.array([error[block] @ error[block] for block in blocks]))
 
     found = [squares(shift) for shift in shifts]
     best = min(range(SHIFTS), key=lambda k: float(found[k].sum()))
