@@ -179,7 +179,8 @@ def test_a_gain_is_known_as_well_as_its_windows_agree():
     assert mean_gain(torch.tensor([9.0, 2.0, 3.0, 4.0]), old) == pytest.approx((-0.2, 0.2))
     assert mean_gain(old[:1], old[:1]) == (0.0, math.inf)
     assert mean_gain(torch.zeros(2), torch.zeros(2)) == (0.0, 0.0)
-    assert mean_gain(torch.tensor([math.inf, 1.0]), torch.ones(2))[0] == -0.5
+    for diverged in (math.inf, math.nan):
+        assert mean_gain(torch.tensor([diverged, 1.0]), torch.ones(2))[0] == -0.5
 
 
 def test_one_lively_window_does_not_outweigh_many_others():

@@ -29,10 +29,10 @@ def mean_gain(new: Tensor, old: Tensor) -> tuple[float, float]:
     """Mean over windows (window,) of (old - new) / (old + new), and its standard error.
 
     That is half the logarithm of the ratio of squares if this is small. It is bounded, since a few
-    windows of lively motion would outweigh all others in a sum of squares. The error is infinite
-    for a single window.
+    windows of lively motion would outweigh all others in a sum of squares. It is -1 where the new
+    motion diverges. The error is infinite for a single window.
     """
-    both = old + new
+    both = old + new.nan_to_num(nan=math.inf)
     gains = torch.where(both > 0, 2 * old / both - 1, torch.zeros_like(both))
     freedom = len(gains) - 1
     spread = math.sqrt(float(gains.var(correction=0)) / freedom) if freedom else math.inf
