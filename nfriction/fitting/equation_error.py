@@ -358,10 +358,11 @@ class _Regression:
             design = torch.cat([p.smoothed(c) for p, c in zip(self.parts, columns, strict=True)])
             candidates.append(self._linear_fit(design, fixed))
         starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
-        # No prior would let a peak narrower than the slowest sample have any height.
+        # No prior would let a peak narrower than the slowest sample have any height. Its width is
+        # that for the whole torque: errors of inertia terms hide how much of it is friction.
         many, least = self.kept.sum(0), residuals.amin(0)
         size = ((self.root * self.torque).square().sum(0) / many).sqrt()
-        sd = prior_sd(law, TorqueFit(starts[0], least, size), self.options)
+        sd = prior_sd(law, TorqueFit(starts[0], 0 * least, size), self.options)
         noise = torch.maximum(least, ROUNDING * size) / many.sqrt()
         best = (residuals.square() + (noise[:, None] * starts / sd).square().sum(-1)).argmin(0)
         coefficients = starts[best, torch.arange(len(best))]
