@@ -82,6 +82,10 @@ class _Data:
         """Means over blocks, (block, ...)."""
         return values.reshape(-1, self.block, *values.shape[1:]).mean(1)
 
+    def at_rate(self, factor: float) -> "_Data":
+        """The same positions at a sample rate that is larger by this factor."""
+        return replace(self, qd=self.qd * factor, qdd=self.qdd * factor**2)
+
     def needed(self, plant: Plant) -> Tensor:
         """Torque of the motion without friction, (sample, joint)."""
         return plant.inverse_dynamics(self.q, self.qd, self.qdd)
@@ -140,7 +144,7 @@ def likely_mistakes(
     # Inertias or torques wrong by the square of a thousand would have the same effect.
     if unit := time_unit(recordings[0].time):
         short, _, rate = unit
-        share = _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
+        share = _unexplained(plant, given.at_rate(rate))
         if noise < stated and share < stated / options.diagnosis_ratio:
             return stated, (Mistake(f"time is in {short}", share),)
     delay = 0.0, sound
@@ -478,7 +482,7 @@ def _corrected_positions(
     yield "the signs of all positions are reversed", recorded(-eye)
     for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
         yield f"positions are in {unit}", recorded(factor * eye)
-    yield "time runs backwards: the motion gains energy", replace(given, qd=-given.qd)
+    yield "time runs backwards: the motion gains energy", given.at_rate(-1.0)
     if chain:
         zero: MeasuredFrom = "hanging" if convention.measured_from == "upright" else "upright"
         other = AngleConvention(convention.angles, zero)
@@ -985,15 +989,10 @@ def _drifting_clock(
 
 
 def _wrong_rate(plant: Plant, given: _Data) -> tuple[str, float]:
-    """The factor on the sample rate that explains most, and the unexplained share [-]."""
-
-    def left(x: float) -> float:
-        rate = math.exp(x)
-        return _unexplained(plant, replace(given, qd=given.qd * rate, qdd=given.qdd * rate**2))
-
+    """The factor of the sample rate that explains most, and the unexplained share [-]."""
     most = math.log(10)
-    x, share = _best(left, -most, most, 17)
-    return f"the sample rate is {math.exp(x):.3g} times that of `time`", share
+    x, share = _best(lambda x: _unexplained(plant, given.at_rate(math.exp(x))), -most, most, 17)
+    return f"the true sample rate is {math.exp(x):.3g} times that in `time`", share
 
 
 def _best(

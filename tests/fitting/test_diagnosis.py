@@ -515,7 +515,7 @@ def test_mistakes_in_conventions_and_time(name):
 def test_a_wrong_sample_rate_is_named(name):
     plant, q, tau = measured(name)
     (text,) = warnings_of(plant, q, tau, time=2.5 * STEP * np.arange(len(q)))
-    assert "likely: the sample rate is 2.5 times that of `time`" in text
+    assert "likely: the true sample rate is 2.5 times that in `time`" in text
 
 
 @pytest.mark.parametrize("rate", [20.0, 500.0, 4000.0, 10000.0])
