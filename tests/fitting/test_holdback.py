@@ -20,7 +20,11 @@ from nfriction.fitting.strategy.holdout import (
     recording_splits,
     settled,
 )
-from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
+from nfriction.fitting.strategy.neurofuzzy import (
+    Validation,
+    initialise_from_constant,
+    revert_to_constant,
+)
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
@@ -73,6 +77,20 @@ def test_every_window_is_held_out_once(constant):
             held_back += judged.spans
         samples = [np.arange(first, last) for _, first, last in sorted(held_back)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
+
+
+def test_windows_of_one_recording_count_once(constant, monkeypatch):
+    """They share a search, so that their scatter is not that between recordings."""
+    joint, found = constant
+    validation = object.__new__(Validation)
+    validation.options = DEFAULTS
+    validation.windows = cut_for_folds([joint] * 3, found.motions * 3, 0.5, FOLDS)
+    monkeypatch.setattr(Validation, "_further", lambda *_: None)
+    monkeypatch.setattr(
+        Validation, "_errors", lambda _, end, test: torch.arange(len(test), dtype=F64)
+    )
+    mean = (len(validation.windows) / 3 - 1) / 2
+    assert validation.by_recording(None).tolist() == pytest.approx([mean] * 3)
 
 
 @pytest.mark.parametrize("count", [2, 5])

@@ -63,9 +63,9 @@ def recording_splits(windows: Windows, folds: int) -> list[tuple[Windows, Window
 
 
 def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float = 1.0) -> str:
-    """Sentence that rejects a network, from squared errors on each window, (window,).
+    """Sentence that rejects a network, from squared errors on each hold-out block, (block,).
 
-    `blocks` names the kind of data that was held out, `least` the required gain (see `improves`).
+    `blocks` names the blocks: windows or recordings; `least` is the required gain, see `improves`.
     """
     change = 100 * (math.sqrt(float(network.sum() / law.sum())) - 1)
     if math.isinf(change):

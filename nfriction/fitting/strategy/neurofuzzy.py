@@ -413,7 +413,7 @@ class Validation:
 
     @cached_property
     def law_by_recording(self) -> Tensor:
-        """Squared errors of the law on each window of hold-out recordings, (window,)."""
+        """Mean squared error of the law on hold-out recordings, (recording,)."""
         return self.by_recording(self.law_trial)
 
     @cached_property
@@ -560,10 +560,14 @@ class Validation:
         return replace(trial, squares=torch.cat(found))
 
     def by_recording(self, trial: Trial) -> Tensor:
-        """Squared errors of a trial on every window, from searches on other recordings."""
+        """Mean squared error of a trial on recordings, (recording,), from searches on the others.
+
+        Windows of one recording share a search, so they are no independent samples.
+        """
         splits = holdout.recording_splits(self.windows, self.options.folds)
         ends = (self._further(trial, train, "other recordings, hold-out") for train, _ in splits)
-        return torch.cat([self._errors(e, test) for e, (_, test) in zip(ends, splits, strict=True)])
+        pairs = zip(ends, splits, strict=True)
+        return torch.stack([self._errors(end, test).mean() for end, (_, test) in pairs])
 
     def _errors(self, end: HorizonResult, test: Windows) -> Tensor:
         """Squared errors of a search on hold-out windows, (window,)."""
