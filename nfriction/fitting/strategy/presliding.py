@@ -31,7 +31,7 @@ PEAKS = (0.1, 0.3, 1.0)
 MOST_STARTS = 4
 
 # Stiffness and damping of an alternative relative to those found: its contacts relax at once.
-STIFFER = (10.0, 0.01)
+STIFFER = (5.0, 0.01)
 
 
 def presliding_starts(

@@ -278,7 +278,8 @@ def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees:
                 f"drop one of the two."
             )
         source = source._replace(unit=unit)
-    return source.factor * _column(table, source.motor or key, source)
+    with np.errstate(invalid="ignore"):  # a signalling NaN, which is refused later
+        return source.factor * _column(table, source.motor or key, source)
 
 
 def _number(name: str) -> int:
