@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from nfriction import LFM, NCFM, Recording, fit, model_info, save, score
+from nfriction import LFM, NCFM, Recording, fit, model_info, save, score_fit
 from nfriction.papers import twin
 
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for interval in found.intervals:
             print(f"  {interval.name}: {interval.value:.4g} ({interval.low:.4g} to "
                   f"{interval.high:.4g})")  # fmt: skip
-        errors[name] = score(found.plant, found.model, test).free_run.all
+        errors[name] = score_fit(found, test).free_run.all
         print(f"  position error on {test.name}: {1e3 * errors[name]:.3g} mrad")
         save(found.model, arguments.out / f"{name}.json", model_info(found, train))
     best = min(errors, key=lambda name: errors[name])

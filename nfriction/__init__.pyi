@@ -4,6 +4,7 @@ from . import export as export
 from . import plots as plots
 from .evaluation.compare import Comparison as Comparison
 from .evaluation.compare import compare as compare
+from .evaluation.compare import score_fit as score_fit
 from .evaluation.cross_validation import Selection as Selection
 from .evaluation.cross_validation import select as select
 from .evaluation.estimators import FrictionEstimator as FrictionEstimator

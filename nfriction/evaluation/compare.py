@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,7 @@ from nfriction.fitting.data.inputs import (
     require_drive,
     warn_of_undriven,
 )
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
+from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning, unlike_training
 from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
@@ -425,28 +426,36 @@ def compare(
         if not fits:
             raise
         progress.resume()
-    warned += _warned(_mistakes(plant, next(iter(fits.values())), data, tested))
+    # The best fit; those with heat depend on the whole motion.
+    best = min(fits.values(), key=lambda fit: (fit.model.state_size, fit.residual))
+    warned += _warned(_mistakes(plant, best, data, tested))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
     for name in (NO_FRICTION, *fits):
         progress.stage(f"score {name}")
-        found = fits.get(name)
+        found, how = fits.get(name), {"horizons": horizons, "zeroed": zeroed}
+        scored = partial(score_fit, found) if found else partial(score, plant, None)
         for part, recordings in (("train", train), ("test", test)):
             if recordings:
                 scores[part][name] = [
-                    score(
-                        found.plant if found else plant, found.model if found else None,
-                        found.aligned(recording) if found else recording,
-                        initial_state=states.get(recording.name), horizons=horizons, zeroed=zeroed,
-                    )
-                    for recording in recordings
-                ]  # fmt: skip
+                    scored(r, initial_state=states.get(r.name), **how) for r in recordings
+                ]
         progress.done()
     return Comparison(
         Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed, test_warnings=warned,
     )  # fmt: skip
+
+
+def score_fit(fit: FitResult, recording: RecordingLike, **settings: Any) -> Score:
+    """Score a fit: `score` with its torque delay, and with encoder zeros if it estimated them.
+
+    `settings` are keyword arguments of `score`.
+    """
+    settings = {"zeroed": bool(fit.encoder_offsets), **settings}
+    given = fit.aligned(Recording.of(recording, plant=fit.plant))
+    return score(fit.plant, fit.model, given, **settings)
 
 
 def _warned(texts: Iterable[str]) -> tuple[str, ...]:
@@ -460,10 +469,20 @@ def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator
     """Likely mistakes in test recordings, unless the fit names some in its own."""
     known, both = {*finer_counts(plant, train.recordings)}, [*train.recordings, *test.recordings]
     yield from (text for text in finer_counts(plant, both) if text not in known)
-    for recording, moved in () if fit.mistakes else zip(*test, strict=True):
-        joint = fit.aligned(recording.joint_coordinates(plant))
-        mistakes = likely_mistakes(plant, [joint], [moved], recording.resolve_convention(plant))
-        yield from (f"{recording.name or 'test'}: {text}" for text in mistake_warning(*mistakes))
+    if fit.mistakes:
+        return
+    trained, tested = (
+        [(fit.aligned(r.joint_coordinates(plant)), m) for r, m in zip(*part, strict=True)]
+        for part in (train, test)
+    )
+    unlike = {}
+    if not fit.model.state_size:
+        unlike = dict(unlike_training(fit.plant, fit.model, trained, tested))
+    for recording, (joint, moved) in zip(test.recordings, tested, strict=True):
+        given = [joint], [moved], recording.resolve_convention(plant)
+        # A motion of another torque may also look like one of another rig.
+        said = unlike.get(joint.name) or mistake_warning(*likely_mistakes(plant, *given))
+        yield from (f"{recording.name or 'test'}: {text}" for text in said)
 
 
 def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:

@@ -13,8 +13,8 @@ import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from nfriction.evaluation.compare import score_fit
 from nfriction.evaluation.lead_in import ZERO_IN, longest_window
-from nfriction.evaluation.score import score
 from nfriction.fitting.data.inputs import release, require_drive
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
@@ -207,10 +207,8 @@ class FrictionEstimator(BaseEstimator):
             has the same columns.
         """
         (read,) = _recordings(recording, self.plant_)
-        given = self._fitted.aligned(read)
-        zeroed = bool(self._fitted.encoder_offsets)
-        run = score(self.plant_, self.model_, given, horizons=(), limit=False, zeroed=zeroed)
-        table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
+        run = score_fit(self._fitted, read, horizons=(), limit=False)
+        table = read.to_pandas()[["time", *(f"q{k + 1}" for k in range(read.joints))]]
         table.iloc[:, 1:] = run.simulated
         return table
 
@@ -227,11 +225,7 @@ class FrictionEstimator(BaseEstimator):
             zeroed, room = bool(self._fitted.encoder_offsets), longest_window(recording)
             # A short recording is scored from the end of its lead-in.
             horizon = min(self.horizon, max(room - ZERO_IN, room / 2) if zeroed else room)
-            aligned = self._fitted.aligned(recording)
-            found = score(
-                self.plant_, self.model_, aligned, horizons=(horizon,), limit=False,
-                zeroed=zeroed,
-            )  # fmt: skip
+            found = score_fit(self._fitted, recording, horizons=(horizon,), limit=False)
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 

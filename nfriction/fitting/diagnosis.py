@@ -6,7 +6,7 @@ shows which correction explains the motion. Each takes one pass of inverse dynam
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +24,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.paired_test import improves, jackknife_sd, student_quantile
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
@@ -199,6 +200,55 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
 
 
+def unlike_training(
+    plant: Plant,
+    friction: FrictionModel,
+    train: Iterable[tuple[Recording, Motion]],
+    test: Iterable[tuple[Recording, Motion]],
+    options: FitOptions = DEFAULTS,
+) -> Iterator[tuple[str, tuple[str]]]:
+    """Names of test recordings that differ from all of training, each with the cause in a sentence.
+
+    With the fitted plant and friction, more torque must be unexplained than in training, and more
+    than its noise explains, and one cause must explain most of it: each by `diagnosis_ratio`.
+    Recordings are in joint coordinates, with their smoothed motions.
+    """
+    usual, ratio, trained = 0.0, options.diagnosis_ratio, [*train]
+    for k, (recording, motion) in enumerate([*trained, *test]):
+        data = _collect([recording], [motion], options)
+        if len(data.q) < FEWEST_BLOCKS * data.block:
+            continue
+        coefficients = friction.coefficients(data.qd, data.qdd)
+        tau_f = friction.steady_torque(data.qd, plant.load(data.q, data.qd), coefficients)
+        left = data.moving * data.mean(data.tau - data.needed(plant) - tau_f)
+        share = _share(plant, data, left.square().mean(0))
+        if k < len(trained):
+            usual = max(usual, share)
+        elif share > ratio * max(usual, _of_noise(plant, data, data.sd_of_mean)):
+            rest, text = min(_causes(plant, data, tau_f, left))
+            if ratio * rest < share:
+                said = f"It differs from the training recordings: {text}. The model leaves "
+                said += f"{share:.2g} of its torque unexplained, after the correction {rest:.2g}, "
+                yield recording.name, (f"{said}and at most {usual:.2g} of theirs.",)
+
+
+def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[tuple[float, str]]:
+    """Unexplained share [-] with each torque scaled or offset, and the change in words."""
+    unit, one = "N" if plant.unit == "m" else "N m", torch.ones_like(tau_f)
+    kinds = ("friction", tau_f), ("torque", data.tau), ("offset", one)
+    for j, name in enumerate(plant.joint_names):
+        for kind, torque in kinds if j in data.driven else kinds[:1]:
+            part = data.moving[:, j] * data.mean(torque[:, j])
+            factor, rest = float(part @ left[:, j] / (part @ part).clamp_min(1e-300)), left.clone()
+            rest[:, j] -= factor * part
+            text = {
+                "friction": f"the friction of {name} is {1 + factor:.3g} times theirs",
+                "torque": f"the torque of {name} is {np.divide(1, 1 - factor):.3g} times theirs",
+                "offset": f"the torque of {name} has an offset of {factor:.3g} {unit}",
+            }[kind]
+            yield _share(plant, data, rest.square().mean(0)), text
+
+
 def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
     """Wrapped angles, counters that overflow, and rows lost, repeated or stale under even times.
 
@@ -303,7 +353,7 @@ def _tested(
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
         if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
             yield from _elastic(plant, given, recordings[0].sample_time)
-    for text, rig in _missing_rotors(plant, given, options):
+    for text, rig in (*_missing_rotors(plant, given, options), *_payloads(plant, given, options)):
         yield text, _unexplained(rig, given)
 
 
@@ -560,6 +610,21 @@ def _missing_rotors(plant: Plant, given: _Data, options: FitOptions) -> Iterator
             seen = f"of {float(armature[j]):.3g} kg m^2 seen at the joint"
             text = f"{name} has a rotor inertia {seen} (`armature`, or that of its `motor`)"
             yield text, plant.replace(armature=armature)
+
+
+def _payloads(plant: Plant, given: _Data, options: FitOptions) -> Iterator[tuple[str, Plant]]:
+    """Each link with a mass at its end, unless the fit corrects its effects by itself."""
+    own, gravity = dict(plant.named_buffers()), plant.to_dict().get("gravity")
+    if not (isinstance(plant, PendulumChain) and gravity) or plant.first_link:
+        return
+    for k, name in enumerate(plant.joint_names):
+        reach = torch.where(torch.arange(plant.joints) <= k, plant.length, 0.0)
+        unit = {"inertia_coupling": torch.outer(reach, reach), "gravity_moment": gravity * reach}
+        mass, (bound, _) = _amount(plant, unit, given), options.ratio_term
+        if mass > 0 and any((mass * part > bound * own[key]).any() for key, part in unit.items()):
+            rig = plant.replace(**{key: own[key] + mass * part for key, part in unit.items()})
+            text = f"the link of {name} carries {mass:.3g} kg at its end that the rig lacks"
+            yield f"{text} (`mass`, `com` and `inertia`)", rig
 
 
 def _scaled_terms(

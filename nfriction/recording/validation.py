@@ -121,7 +121,7 @@ def _check_stamps(time: Array) -> None:
     k = int(np.argmax(steps < 0) if (steps < 0).any() else np.argmax(steps <= 0))
     before, after = float(time[k]), float(time[k + 1])
     if before > after:
-        remedy = "sort the rows and drop repeated stamps"
+        remedy = "sort the rows and drop repeated stamps, or unwrap a counter (`numpy.unwrap`)"
         usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
         if (np.abs(time[1:][steps < 0] - time[0]) <= 2 * usual).all():
             remedy = "it starts again there, so read each recording in the file separately"

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from nfriction import LFM, NFLFM, Recording, Rotor, compare
+from nfriction import CVFM, LFM, NFLFM, LinearAxis, Recording, Rotor, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
 from nfriction.evaluation.compare import Comparison, Fits, coefficient_summary
 from nfriction.evaluation.parallel import Progress
@@ -16,7 +16,7 @@ from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.io.model_file import load_info
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import driven_axis, pendulum, swing
 
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
 A, B = (swing(pendulum(), MODEL, seconds=1.5, start=s, name=n)
@@ -179,6 +179,30 @@ def test_a_mistake_in_a_test_recording_is_named(recwarn):
     small = dataclasses.replace(B, q=np.deg2rad(B.q))
     with pytest.warns(UserWarning, match=r"joint1 changes by 1.34e-05 rad in b, by at least"):
         compare(pendulum(), "NCFM", A, small, **settings)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"friction": 1.5}, r"the friction of joint1 is 1\.[45]\d* times theirs"),
+        ({"gain": 1.3}, r"the torque of joint1 is 1\.(29|3)\d* times theirs"),
+        ({"bias": 0.1}, r"the torque of joint1 has an offset of 0\.(09|1)\d* N"),
+        ({}, ""),
+    ],
+)
+def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, text):
+    axis, recordings = LinearAxis(2.0), []
+    for name in ("train", "test"):
+        own = change if name == "test" else {}
+        truth = CVFM(1, [[0.8 * own.get("friction", 1), 2.0 * own.get("friction", 1)]])
+        made = driven_axis(axis, truth.requires_grad_(False), seconds=4.0)
+        tau = made.tau * own.get("gain", 1) + own.get("bias", 0)
+        # Not the same recording twice.
+        cut = slice(0, None) if name == "train" else slice(100, None)
+        recordings.append(dataclasses.replace(made, tau=tau, name=name)[cut])
+    compare(axis, "CVFM", *recordings, horizons=(0.5,), windows=(0.5,), fit_plant=False)
+    said = [str(w.message) for w in recwarn if "differs from the training" in str(w.message)]
+    assert [bool(re.search(text, sentence)) for sentence in said] == [True] * bool(text), said
 
 
 def test_noise_at_rest_is_no_faster_motion(recwarn):

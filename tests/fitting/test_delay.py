@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LinearAxis, Recording, compare, fit, rollout
+from nfriction import CVFM, LinearAxis, Recording, compare, fit, rollout, score_fit
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
@@ -53,6 +53,7 @@ def test_a_fitted_delay_is_found_with_its_interval():
     assert found.converged
     # Half a sample: the torque is held over a sample, and the log between them is a line.
     assert found.torque_delay == pytest.approx(LATE, abs=1e-3)
+    assert score_fit(found, recording, limit=False).free_run.all < 0.1 * late.residual
     (interval,) = (i for i in found.intervals if i.name == TORQUE_DELAY)
     assert 0 < interval.sd < 1e-3
     truth = torch.tensor(TRUTH, dtype=F64)

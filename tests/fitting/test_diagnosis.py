@@ -365,6 +365,12 @@ def test_mistakes_in_torques(name, change, finding):
         ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
         ("driven", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
+        # The same link without 0.05 kg at its end.
+        (
+            "driven",
+            {"mass": [0.5, 0.25], "com": [0.15, 0.094], "inertia": [3.75e-3, 5.46e-4]},
+            "the link of joint2 carries 0.0491 kg at its end",
+        ),
         ("wheel", {"motor": Motor(50, rotor_inertia=120)}, "each `rotor_inertia` is in g cm^2"),
         (
             "driven",
