@@ -356,6 +356,8 @@ class Recording:
             ValueError: broken content or missing columns; names the file.
         """
         # Before the file is read, so that the message for a wrong argument does not name the file.
+        if not isinstance(columns or {}, Mapping):
+            raise ValueError(f'`columns` must be like {{"q1": "enc:deg"}}, got {columns!r}.')
         if convention is not None:
             convention = AngleConvention.of(convention)
         table = formats.read_table(path, list((columns or {}).values()))

@@ -555,7 +555,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 )
             if not jump.any():
                 continue
-            cause = "samples are missing there without a gap in time, or the encoder lost counts"
+            cause = "samples are missing there without a gap in time, or the encoder lost counts or froze"
             remedy = "give samples their own times, or cut the recording there"
             # Two jumps by the same amount are not chance.
             if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
@@ -570,7 +570,7 @@ def _far_samples(x: Array, options: FitOptions) -> tuple[NDArray[np.bool_], Arra
     near, other = np.sort(np.abs([before, after]), axis=0)
     # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
     height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
-    curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
+    curved = np.quantile(np.abs(before + after) / 2, 0.95, axis=0)
     # A joint may show no count.
     least = options.spike_ratio * np.fmax(curved, count_seen(x))
     return height > least, least
