@@ -1,5 +1,6 @@
 """Compare friction models: fit each to training recordings, score it on test recordings."""
 
+import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ from nfriction.fitting.data.inputs import (
     warn_of_undriven,
 )
 from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning, unlike_training
-from nfriction.fitting.options import checked_lengths
+from nfriction.fitting.options import DEFAULTS, checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
 from nfriction.friction.heat import HEAT
@@ -426,9 +427,9 @@ def compare(
         if not fits:
             raise
         progress.resume()
-    # The best fit; those with heat depend on the whole motion.
+    # Fits without heat first, whose friction depends on the current motion.
     best = min(fits.values(), key=lambda fit: (fit.model.state_size, fit.residual))
-    warned += _warned(_mistakes(plant, best, data, tested))
+    warned += _warned(_mistakes(plant, best, data, tested, faster=bool(warned)))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
@@ -465,8 +466,13 @@ def _warned(texts: Iterable[str]) -> tuple[str, ...]:
     return found
 
 
-def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator[str]:
-    """Likely mistakes in test recordings, unless the fit names some in its own."""
+def _mistakes(
+    plant: Plant, fit: FitResult, train: Data, test: Data, *, faster: bool
+) -> Iterator[str]:
+    """Likely mistakes in test recordings, unless the fit names some in its own.
+
+    `faster` is true if friction is extrapolated to their speeds.
+    """
     known, both = {*finer_counts(plant, train.recordings)}, [*train.recordings, *test.recordings]
     yield from (text for text in finer_counts(plant, both) if text not in known)
     if fit.mistakes:
@@ -476,12 +482,18 @@ def _mistakes(plant: Plant, fit: FitResult, train: Data, test: Data) -> Iterator
         for part in (train, test)
     )
     unlike = {}
-    if not fit.model.state_size:
+    # Friction at other speeds, or with a state, may differ although nothing has changed.
+    if not (faster or fit.model.state_size or fit.model.law_state_size):
         unlike = dict(unlike_training(fit.plant, fit.model, trained, tested))
     for recording, (joint, moved) in zip(test.recordings, tested, strict=True):
-        given = [joint], [moved], recording.resolve_convention(plant)
-        # A motion of another torque may also look like one of another rig.
-        said = unlike.get(joint.name) or mistake_warning(*likely_mistakes(plant, *given))
+        stated, mistakes = likely_mistakes(
+            plant, [joint], [moved], recording.resolve_convention(plant)
+        )
+        said, change = mistake_warning(stated, mistakes), unlike.get(joint.name)
+        # Another torque may look like another rig, which that of training contradicts.
+        least = min((m.unexplained for m in mistakes), default=math.inf)
+        if change and change.unexplained < DEFAULTS.diagnosis_tie * least:
+            said = (change.text,)
         yield from (f"{recording.name or 'test'}: {text}" for text in said)
 
 

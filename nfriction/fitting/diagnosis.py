@@ -206,47 +206,58 @@ def unlike_training(
     train: Iterable[tuple[Recording, Motion]],
     test: Iterable[tuple[Recording, Motion]],
     options: FitOptions = DEFAULTS,
-) -> Iterator[tuple[str, tuple[str]]]:
-    """Names of test recordings that differ from all of training, each with the cause in a sentence.
+) -> Iterator[tuple[str, Mistake]]:
+    """Names of test recordings that differ from those of training, each with the cause.
 
-    With the fitted plant and friction, more torque must be unexplained than in training, and more
-    than its noise explains, and one cause must explain most of it: each by `diagnosis_ratio`.
-    Recordings are in joint coordinates, with their smoothed motions.
+    With the fitted plant and friction, `diagnosis_ratio` times more torque must be unexplained than
+    in training and than noise explains, and less after the correction. Recordings are in joint
+    coordinates, with their smoothed motions; friction depends on the current motion alone.
     """
-    usual, ratio, trained = 0.0, options.diagnosis_ratio, [*train]
+    shares, ratio, trained = [], options.diagnosis_ratio, [*train]
     for k, (recording, motion) in enumerate([*trained, *test]):
         data = _collect([recording], [motion], options)
         if len(data.q) < FEWEST_BLOCKS * data.block:
             continue
         coefficients = friction.coefficients(data.qd, data.qdd)
-        tau_f = friction.steady_torque(data.qd, plant.load(data.q, data.qd), coefficients)
+        tau_f = friction.torque(data.qd, plant.load(data.q, data.qd), coefficients)
         left = data.moving * data.mean(data.tau - data.needed(plant) - tau_f)
         share = _share(plant, data, left.square().mean(0))
         if k < len(trained):
-            usual = max(usual, share)
-        elif share > ratio * max(usual, _of_noise(plant, data, data.sd_of_mean)):
-            rest, text = min(_causes(plant, data, tau_f, left))
-            if ratio * rest < share:
+            shares.append(share)
+        elif shares and math.inf > share > ratio * (usual := max(shares)):
+            most = ratio * max(usual, _of_noise(plant, data, data.sd_of_mean))
+            rest, text = min(_causes(plant, data, tau_f, left), default=(math.inf, ""))
+            if rest < most < share:
                 said = f"It differs from the training recordings: {text}. The model leaves "
                 said += f"{share:.2g} of its torque unexplained, after the correction {rest:.2g}, "
-                yield recording.name, (f"{said}and at most {usual:.2g} of theirs.",)
+                yield recording.name, Mistake(f"{said}and {usual:.2g} of theirs.", rest)
 
 
 def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[tuple[float, str]]:
-    """Unexplained share [-] with each torque scaled or offset, and the change in words."""
-    unit, one = "N" if plant.unit == "m" else "N m", torch.ones_like(tau_f)
-    kinds = ("friction", tau_f), ("torque", data.tau), ("offset", one)
+    """Unexplained share [-] with other friction, or a scaled or offset torque, and the change."""
+    kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
+    zero = ", or its encoder has another zero" * weighs(plant)
+    own, tau = (data.moving * data.mean(x) for x in (tau_f, data.tau))
     for j, name in enumerate(plant.joint_names):
-        for kind, torque in kinds if j in data.driven else kinds[:1]:
-            part = data.moving[:, j] * data.mean(torque[:, j])
-            factor, rest = float(part @ left[:, j] / (part @ part).clamp_min(1e-300)), left.clone()
-            rest[:, j] -= factor * part
-            text = {
-                "friction": f"the friction of {name} is {1 + factor:.3g} times theirs",
-                "torque": f"the torque of {name} is {np.divide(1, 1 - factor):.3g} times theirs",
-                "offset": f"the torque of {name} has an offset of {factor:.3g} {unit}",
-            }[kind]
-            yield _share(plant, data, rest.square().mean(0)), text
+
+        def fitted(shapes: Tensor, joint: int = j) -> tuple[Tensor, float]:
+            part = torch.zeros_like(left)
+            part[:, joint] = shapes @ (torch.linalg.pinv(shapes) @ left[:, joint])
+            return part, _share(plant, data, (left - part).square().mean(0))
+
+        part, share = fitted(data.friction[:, j])
+        times = 1 + float(part[:, j] @ own[:, j]) / float(own[:, j] @ own[:, j] or math.inf)
+        # A wrong sign has causes of its own.
+        if times > 0:
+            yield share, f"the friction of {name} is {times:.3g} times theirs"
+        if j in data.driven:
+            part, share = fitted(tau[:, [j]])
+            rest = 1 - float(part[:, j] @ tau[:, j]) / float(tau[:, j] @ tau[:, j] or math.inf)
+            if rest > 0:
+                yield share, f"the {kind} of {name} is {1 / rest:.3g} times theirs"
+            part, share = fitted(data.moving[:, [j]])
+            size = float(part[:, j].sum() / data.moving[:, j].sum().clamp_min(1))
+            yield share, f"the {kind} of {name} has an offset of {size:.3g} {unit}{zero}"
 
 
 def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:

@@ -282,6 +282,7 @@ class Recording:
             RecordingWarning: velocity or torque of some joints only, unread columns that look like
                 torque; and as `Recording`.
         """
+        _check_columns(columns)
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
         factors = None if plant is None else plant.motor_factors
@@ -356,8 +357,7 @@ class Recording:
             ValueError: broken content or missing columns; names the file.
         """
         # Before the file is read, so that the message for a wrong argument does not name the file.
-        if not isinstance(columns or {}, Mapping):
-            raise ValueError(f'`columns` must be like {{"q1": "enc:deg"}}, got {columns!r}.')
+        _check_columns(columns)
         if convention is not None:
             convention = AngleConvention.of(convention)
         table = formats.read_table(path, list((columns or {}).values()))
@@ -475,6 +475,11 @@ def read_initial_states(
     if not states:
         raise ValueError(f"'{path}' has no rows; write one per recording with {', '.join(wanted)}.")
     return states
+
+
+def _check_columns(columns: object) -> None:
+    if not isinstance(columns, Mapping | None):
+        raise ValueError(f'`columns` must be like {{"q1": "enc:deg"}}, got {columns!r}.')
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -185,8 +185,10 @@ def test_a_mistake_in_a_test_recording_is_named(recwarn):
     ("change", "text"),
     [
         ({"friction": 1.5}, r"the friction of joint1 is 1\.[45]\d* times theirs"),
-        ({"gain": 1.3}, r"the torque of joint1 is 1\.(29|3)\d* times theirs"),
-        ({"bias": 0.1}, r"the torque of joint1 has an offset of 0\.(09|1)\d* N"),
+        ({"gain": 1.3}, r"the force of joint1 is 1\.(29|3)\d* times theirs"),
+        ({"bias": 0.1}, r"the force of joint1 has an offset of 0\.(09|1)\d* N"),
+        # A mistake with a name of its own.
+        ({"gain": -1.0}, ""),
         ({}, ""),
     ],
 )
@@ -197,7 +199,7 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
         truth = CVFM(1, [[0.8 * own.get("friction", 1), 2.0 * own.get("friction", 1)]])
         made = driven_axis(axis, truth.requires_grad_(False), seconds=4.0)
         tau = made.tau * own.get("gain", 1) + own.get("bias", 0)
-        # Not the same recording twice.
+        # Recordings must differ.
         cut = slice(0, None) if name == "train" else slice(100, None)
         recordings.append(dataclasses.replace(made, tau=tau, name=name)[cut])
     compare(axis, "CVFM", *recordings, horizons=(0.5,), windows=(0.5,), fit_plant=False)

@@ -84,13 +84,14 @@ def test_windows_of_one_recording_count_once(constant, monkeypatch):
     joint, found = constant
     validation = object.__new__(Validation)
     validation.options = DEFAULTS
-    validation.windows = cut_for_folds([joint] * 3, found.motions * 3, 0.5, FOLDS)
+    validation.windows = cut_for_folds([joint] * 3 * FOLDS, found.motions * 3 * FOLDS, 0.5, FOLDS)
     monkeypatch.setattr(Validation, "_further", lambda *_: None)
-    monkeypatch.setattr(
-        Validation, "_errors", lambda _, end, test: torch.arange(len(test), dtype=F64)
-    )
-    mean = (len(validation.windows) / 3 - 1) / 2
-    assert validation.by_recording(None).tolist() == pytest.approx([mean] * 3)
+
+    def places(_, end, test):
+        return torch.tensor([place for place, *_ in test.spans], dtype=F64)
+
+    monkeypatch.setattr(Validation, "_errors", places)
+    assert validation.by_recording(None).tolist() == [*range(3 * FOLDS)]
 
 
 @pytest.mark.parametrize("count", [2, 5])

@@ -209,8 +209,8 @@ def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
         Recording.from_pandas(table, columns={"tau1": "motor"})
     with pytest.raises(ValueError, match="names tau3, but the last position is q2"):
         Recording.from_pandas(table, columns={"tau3": "tau1"})
-    with pytest.raises(ValueError, match="`columns` must be like .*, got 'q1=enc:deg'"):
-        Recording.read("log.csv", columns="q1=enc:deg")
+    with pytest.raises(ValueError, match=r"`columns` must be like .*, got 'q1=enc:deg'"):
+        Recording.read("log.csv", columns="q1=enc:deg")  # type: ignore[arg-type]
 
 
 def test_foreign_csv_with_blanks_and_byte_order_mark(tmp_path: Path) -> None:

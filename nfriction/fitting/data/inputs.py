@@ -555,7 +555,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
                 )
             if not jump.any():
                 continue
-            cause = "samples are missing there without a gap in time, or the encoder lost counts or froze"
+            cause = "samples are missing without a gap in time, or the encoder lost counts or froze"
             remedy = "give samples their own times, or cut the recording there"
             # Two jumps by the same amount are not chance.
             if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
@@ -564,13 +564,18 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
             yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
 
 
-def _far_samples(x: Array, options: FitOptions) -> tuple[NDArray[np.bool_], Array]:
-    """True where an inner sample is far from both neighbours, and the least such distance."""
+def _far_samples(
+    x: Array, options: FitOptions, most: float = 0.01
+) -> tuple[NDArray[np.bool_], Array]:
+    """True where an inner sample is far from both neighbours, and the least such distance.
+
+    At most a share `most` of the curvatures may be of spikes.
+    """
     before, after = x[1:-1] - x[:-2], x[1:-1] - x[2:]
     near, other = np.sort(np.abs([before, after]), axis=0)
     # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
     height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
-    curved = np.quantile(np.abs(before + after) / 2, 0.95, axis=0)
+    curved = np.quantile(np.abs(before + after) / 2, 1 - most, axis=0)
     # A joint may show no count.
     least = options.spike_ratio * np.fmax(curved, count_seen(x))
     return height > least, least
@@ -581,7 +586,7 @@ def _torque_spikes(recordings: Sequence[Recording], options: FitOptions) -> Iter
     for recording in recordings:
         if recording.tau is None:
             continue
-        far, _ = _far_samples(recording.tau, options)
+        far, _ = _far_samples(recording.tau, options, 0.05)
         for name, peak in zip(recording.names, far.T, strict=True):
             if peak.any():
                 yield (

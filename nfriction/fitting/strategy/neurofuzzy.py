@@ -564,10 +564,12 @@ class Validation:
 
         Windows of one recording share a search, so they are no independent samples.
         """
-        splits = holdout.recording_splits(self.windows, self.options.folds)
-        ends = (self._further(trial, train, "other recordings, hold-out") for train, _ in splits)
-        pairs = zip(ends, splits, strict=True)
-        return torch.stack([self._errors(end, test).mean() for end, (_, test) in pairs])
+        found = []
+        for train, test in holdout.recording_splits(self.windows, self.options.folds):
+            squares = self._errors(self._further(trial, train, "other recordings, hold-out"), test)
+            place = torch.tensor([place for place, *_ in test.spans])
+            found += [squares[place == k].mean() for k in place.unique()]
+        return torch.stack(found)
 
     def _errors(self, end: HorizonResult, test: Windows) -> Tensor:
         """Squared errors of a search on hold-out windows, (window,)."""
