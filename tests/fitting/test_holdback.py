@@ -12,6 +12,7 @@ from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.paired_test import improves
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
     cut_for_folds,
@@ -92,6 +93,14 @@ def test_windows_of_one_recording_count_once(constant, monkeypatch):
 
     monkeypatch.setattr(Validation, "_errors", places)
     assert validation.by_recording(None).tolist() == [*range(3 * FOLDS)]
+
+
+@pytest.mark.parametrize(
+    ("errors", "lost"), [([1.1, 1.1, 3.0], True), ([1.1, 3.0], False), ([0.9, 1.1, 3.0], False)]
+)
+def test_a_network_worse_on_every_recording_is_lost(errors, lost):
+    new = torch.tensor(errors, dtype=F64)
+    assert neurofuzzy._lost(torch.ones_like(new), new, 0.05) == lost
 
 
 @pytest.mark.parametrize("count", [2, 5])
