@@ -427,7 +427,7 @@ def compare(
         if not fits:
             raise
         progress.resume()
-    # Fits without heat first, whose friction depends on the current motion.
+    # Fits without heat come first: their friction depends on the current motion alone.
     best = min(fits.values(), key=lambda fit: (fit.model.state_size, fit.residual))
     warned += _warned(_mistakes(plant, best, data, tested, faster=bool(warned)))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
@@ -490,7 +490,7 @@ def _mistakes(
             plant, [joint], [moved], recording.resolve_convention(plant)
         )
         said, change = mistake_warning(stated, mistakes), unlike.get(joint.name)
-        # Another torque may look like another rig, which that of training contradicts.
+        # A changed torque may look like a wrong rig, which the training recordings contradict.
         least = min((m.unexplained for m in mistakes), default=math.inf)
         if change and change.unexplained < DEFAULTS.diagnosis_tie * least:
             said = (change.text,)

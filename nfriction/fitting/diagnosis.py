@@ -238,25 +238,28 @@ def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[
     kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
     zero = ", or its encoder has another zero" * weighs(plant)
     own, tau = (data.moving * data.mean(x) for x in (tau_f, data.tau))
+
+    def fitted(j: int, shapes: Tensor) -> tuple[Tensor, float]:
+        part, rest = shapes @ (torch.linalg.pinv(shapes) @ left[:, j]), left.clone()
+        rest[:, j] -= part
+        return part, _share(plant, data, rest.square().mean(0))
+
+    def relative(part: Tensor, whole: Tensor) -> float:
+        return float(part @ whole) / float(whole @ whole or math.inf)
+
     for j, name in enumerate(plant.joint_names):
-
-        def fitted(shapes: Tensor, joint: int = j) -> tuple[Tensor, float]:
-            part = torch.zeros_like(left)
-            part[:, joint] = shapes @ (torch.linalg.pinv(shapes) @ left[:, joint])
-            return part, _share(plant, data, (left - part).square().mean(0))
-
-        part, share = fitted(data.friction[:, j])
-        times = 1 + float(part[:, j] @ own[:, j]) / float(own[:, j] @ own[:, j] or math.inf)
+        part, share = fitted(j, data.friction[:, j])
+        times = 1 + relative(part, own[:, j])
         # A wrong sign has causes of its own.
         if times > 0:
             yield share, f"the friction of {name} is {times:.3g} times theirs"
         if j in data.driven:
-            part, share = fitted(tau[:, [j]])
-            rest = 1 - float(part[:, j] @ tau[:, j]) / float(tau[:, j] @ tau[:, j] or math.inf)
-            if rest > 0:
-                yield share, f"the {kind} of {name} is {1 / rest:.3g} times theirs"
-            part, share = fitted(data.moving[:, [j]])
-            size = float(part[:, j].sum() / data.moving[:, j].sum().clamp_min(1))
+            part, share = fitted(j, tau[:, [j]])
+            true = 1 - relative(part, tau[:, j])
+            if true > 0:
+                yield share, f"the {kind} of {name} is {1 / true:.3g} times theirs"
+            part, share = fitted(j, data.moving[:, [j]])
+            size = relative(part, data.moving[:, j])
             yield share, f"the {kind} of {name} has an offset of {size:.3g} {unit}{zero}"
 
 

@@ -52,7 +52,7 @@ class FitOptions:
     zero_reading: float = 2e-3
     # Below this number of counts, quantisation is most of a joint's apparent motion.
     min_counts: int = 10
-    # A sample is a spike if its distance from both neighbours is this many times a high quantile.
+    # A spike is this many times as far from both neighbours as 99 % of samples (95 % of torques).
     spike_ratio: float = 20.0
     # Steps of one nominal rate differ by less than the first (the error of a quartz, with a
     # margin), those of deliberately different rates by more than the second.

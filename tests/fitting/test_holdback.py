@@ -100,7 +100,7 @@ def test_windows_of_one_recording_count_once(constant, monkeypatch):
 )
 def test_a_network_worse_on_every_recording_is_lost(errors, lost):
     new = torch.tensor(errors, dtype=F64)
-    assert neurofuzzy._lost(torch.ones_like(new), new, 0.05) == lost
+    assert neurofuzzy._worse(torch.ones_like(new), new, 0.05) == lost
 
 
 @pytest.mark.parametrize("count", [2, 5])

@@ -114,14 +114,6 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
-def _lost(old: Tensor, new: Tensor, chance: float) -> bool:
-    """True if squared errors on hold-out recordings (recording,) rose, or all of at least three.
-
-    Student's test of so few has little power; two both rise by chance in a quarter of all cases.
-    """
-    return improves(old, new, chance) or (len(old) > 2 and bool((new > old).all()))
-
-
 def _ripple(plant: Plant) -> str:
     """A sentence about the positions where friction is largest."""
     rows = zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)
@@ -144,13 +136,22 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     least = task.options.network_gain
     # An input may show only in the network: the law alone need not gain.
     worse = improves(old.of_law, new.of_law, chance)
-    if worse or (new.several and _lost(old.law_by_recording, new.law_by_recording, chance)):
+    if worse or (new.several and _worse(old.law_by_recording, new.law_by_recording, chance)):
         return (), plain
     rival.train()
     better = improves(rival.squares, plain.squares, least=least)
     # Friction of the constant law may drive a joint even if that of its network does not.
     drives = inputs.friction_drives(rival.found, len(task.model.law.names))
     return (chosen, rival) if better and not drives else ((), plain)
+
+
+def _worse(old: Tensor, new: Tensor, chance: float) -> bool:
+    """True if squared errors on hold-out recordings (recording,) rose by more than their scatter.
+
+    Also if each of at least three rose, since the test of so few has little power. Two both rise by
+    chance in a quarter of all cases.
+    """
+    return improves(old, new, chance) or (len(old) > 2 and bool((new > old).all()))
 
 
 class _Contest:
@@ -521,7 +522,7 @@ class Validation:
         if not self.several:
             return ""
         law, found = self.law_by_recording, self.by_recording(trial)
-        lost = _lost(law, found, self.options.input_chance)
+        lost = _worse(law, found, self.options.input_chance)
         return holdout.verdict(found, law, "recordings") if lost else ""
 
     def lost_over_long_windows(self, end: HorizonResult) -> str:
