@@ -65,6 +65,11 @@ def late(r: Recording) -> Recording:
     return r._replace(tau=np.concatenate([np.repeat(r.tau[:1], 15, 0), r.tau[:-15]]))
 
 
+def drifting(r: Recording) -> Recording:
+    """A zero of the first torque sensor that moves by 0.03 N m."""
+    return r._replace(tau=np.add(r.tau, np.outer(0.03 * r.time / r.time[-1], (1.0, 0.0))))
+
+
 def reversed_in_time(r: Recording) -> Recording:
     return r._replace(q=r.q[::-1].copy())
 
@@ -108,6 +113,13 @@ def mistakes() -> Iterator[Mistake]:
         name = f"500 Hz taken for 250, {'free' if free else 'driven'}"
         yield Mistake(name, "sample rate is", lambda r: r._replace(time=2 * r.time), free=free)
     yield Mistake("torque constant 15 % off", "times those of the rig", scaled(tau=both(1.15)))
+    yield Mistake(
+        "torque constant 15 %, masses 6 % off",
+        "times those of the rig",
+        scaled(tau=both(1.15)),
+        rig={"mass": [0.636, 0.376]},
+    )
+    yield Mistake("a torque sensor's zero drifts", "offset of the torque of joint1 grows", drifting)
     yield Mistake("motor's angle as the joint's (1:5)", "too large|gear ratio",
                   scaled(q=both(5.0)))  # fmt: skip
     yield Mistake("horizontal instead of vertical", "horizontal",

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import torch
@@ -805,13 +805,14 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
 
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
-) -> Iterator[str]:
-    """A sentence for each joint whose friction changes, during recordings or between them.
+) -> Iterator[tuple[str, str]]:
+    """Joints whose friction, or offset of a drive, changes with time: which, and a sentence.
 
-    For the arguments see `likely_mistakes`. A wrong law, rig or delay must not appear as a change:
-    friction may be any function of speed plus a share of the torque, and the rig is fitted as well.
-    The change has to exceed the scatter of its estimates with each piece of the sliding left out,
-    and to predict the torque of these pieces: in a short motion, time and falling speed look alike.
+    Changes may happen during recordings or between them. For the arguments see `likely_mistakes`. A
+    wrong law, rig or delay must not appear as a change: friction may be any function of speed plus
+    a share of the torque, and the rig is fitted as well. The change has to exceed the scatter of
+    its estimates with each piece of the sliding left out, and to predict the torque of these
+    pieces: in a short motion, time and falling speed look alike.
     """
     data, pieces = _collect(recordings, motions, options), options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
@@ -820,53 +821,64 @@ def changing_friction(
     # At a constant rate, or as a warm-up of which 95 % is over at the end.
     during = [("during a recording", x) for x in (time, 1 - torch.exp(-3 * time / time.max()))]
     onward = "from the first recording to the last", number
-    for j in range(plant.joints):
+    kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
+    for j, joint in enumerate(plant.joint_names):
         *means, sliding = _of_sliding(plant, data, j, options)
-        friction, of_rig, torque = terms = [x[sliding] for x in means]
+        friction, of_rig, torque = (x[sliding] for x in means)
+        terms = friction, of_rig, torque
         if (count := len(friction)) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
+        kinds = ["friction", "offset"] if j in data.driven else ["friction"]
         piece, between = torch.arange(count) * pieces // count, [onward]
         if len(recordings) > 2:
             # The recording whose friction differs most from that of the others.
             alone = [(number == k).to(number) for k in range(len(recordings))]
-            own = [_growth(piece < 0, friction, of_rig, torque, x[sliding])[0] for x in alone]
+            own = [_growth("friction", piece < 0, *terms, x[sliding])[0] for x in alone]
             odd = int(np.argmax(np.abs(own)))
             name = names_of(recordings)[odd]
             between.append((f"in {name} relative to the others", alone[odd]))
-        for clocks in (during, between):
+        # Between recordings, a gain that differs between directions would look like an offset.
+        for clocks, shown in ((during, kinds), (between, kinds[:1])):
             tried = []
             # Per time of sliding, in pieces that all contain some: rest shows nothing.
-            for period, whole in clocks:
+            for (period, whole), changed in product(clocks, shown):
                 clock = whole[sliding]
                 span = clock.max() - clock.min()
                 if span == 0:
                     continue
                 given = [*terms, clock / span]
-                found = [_growth(piece == k, *given) for k in range(pieces)]
-                rates, squares = zip(*found, strict=True)
+                found = [_growth(changed, piece == k, *given) for k in range(pieces)]
+                rates, squares, _ = zip(*found, strict=True)
                 constant, growing = torch.stack(squares).T
                 mean = float((clock - clock.min()).mean() / span)
-                change = _growth(piece < 0, *given)[0]
+                change, _, size = _growth(changed, piece < 0, *given)
                 # No friction changes its sign; an exponential may fit where a line does not.
-                if change * (1 - mean) > -1 and change * mean < 1:
-                    tried.append((growing, constant, np.var(rates), change, mean, period))
+                if changed == "offset" or (change * (1 - mean) > -1 and change * mean < 1):
+                    of = growing, constant, np.var(rates), change, mean, period, changed, size
+                    tried.append(of)
             if not tried:
                 continue
             best = min(tried, key=lambda x: float(x[0].sum()))
-            growing, constant, variance, rate, mean, period = best
+            growing, constant, variance, rate, mean, period, changed, size = best
             sd = math.sqrt((pieces - 1) * variance)
             least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
-            if abs(rate) > least and improves(growing, constant, options.drift_chance):
+            if abs(rate) <= least or not improves(growing, constant, options.drift_chance):
+                continue
+            sd *= student_quantile(pieces - 1, 0.975)
+            if changed == "offset":
+                change, reach = (float(f"{abs(x) * size:.2g}") for x in (rate, sd))
+                what = f"offset of the {kind} of {joint}"
+                cause = f"{change:g} ± {reach:g} {unit} {period} (sensor, amplifier)"
+            else:
                 first, last = 1 - rate * mean, 1 + rate * (1 - mean)
                 ratio, slope = last / first, (1 - mean) / last + mean / first
-                sd *= ratio * slope * student_quantile(pieces - 1, 0.975)
-                change, reach = (float(f"{100 * x:.2g}") for x in (abs(ratio - 1), sd))
-                yield (
-                    f"The friction of {plant.joint_names[j]} {'grows' if rate > 0 else 'falls'} by "
-                    f"{change:g} ± {reach:g} % {period} (warm-up, payload); the intervals do not "
-                    "cover this."
-                )
+                change, reach = (100 * abs(ratio - 1), 100 * sd * ratio * slope)
+                change, reach = (float(f"{x:.2g}") for x in (change, reach))
+                what = f"friction of {joint}"
+                cause = f"{change:g} ± {reach:g} % {period} (warm-up, payload)"
+            way = "grows" if rate > 0 else "falls"
+            yield changed, f"The {what} {way} by {cause}; the intervals do not cover this."
 
 
 def loose_loads(
@@ -949,20 +961,24 @@ def _of_sliding(plant: Plant, data: _Data, j: int, options: FitOptions) -> tuple
 
 
 def _growth(
-    left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
-) -> tuple[float, Tensor]:
-    """Growth of friction per unit of time, relative to its mean [-].
+    changed: str, left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
+) -> tuple[float, Tensor, float]:
+    """Growth of the friction, or of an offset, per unit of time, relative to the friction [-].
 
     From the terms of friction and of the rig, (block, term) each, that explain the torque. Also
-    returns the sums of squared torque errors of constant and growing friction on hold-out blocks.
+    returns the sums of squared torque errors without and with the growth on hold-out blocks, and
+    the root mean square of the friction.
     """
     known, seen = torch.cat([friction, of_rig], 1), ~left_out
     constant = torch.linalg.lstsq(known[seen], torque[seen], driver="gelsd").solution
-    growing = (time - time[seen].mean()) * (friction @ constant[: friction.shape[1]])
+    usual = friction @ constant[: friction.shape[1]]
+    size = usual.square().mean().sqrt()
+    growing = (time - time[seen].mean()) * (usual if changed == "friction" else size)
     terms = torch.cat([known, growing], 1)
     found = torch.linalg.lstsq(terms[seen], torque[seen], driver="gelsd").solution
     missed = [torque - known @ constant, torque - terms @ found]
-    return float(found[-1]), torch.stack([x[left_out].square().sum() for x in missed])
+    squares = torch.stack([x[left_out].square().sum() for x in missed])
+    return float(found[-1]), squares, float(size)
 
 
 def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:

@@ -115,6 +115,6 @@ def fit(
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     found = strategy(task)
-    found = found.with_warnings(task.data_warnings, task.mistakes, (*task.drift, *task.play))
+    found = found.with_warnings(task.data_warnings, task.mistakes, (*task.drift, *task.unmodelled))
     # A law with heat explains friction that changes with time.
     return found.without(task.drift) if has_input(found.model.law, "heat") else found

@@ -43,7 +43,7 @@ class FitTask:
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     drift: tuple[str, ...] = ()  # those of `data_warnings` on changes of friction
-    play: tuple[str, ...] = ()  # those on play of gears
+    unmodelled: tuple[str, ...] = ()  # those on other effects that no law describes
 
 
 def prepare_task(
@@ -105,19 +105,24 @@ def prepare_task(
         # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
     of = plant, advanced, moved, options
-    drift = () if mistakes else tuple(diagnosis.changing_friction(*of))
-    play = () if mistakes else tuple(diagnosis.loose_loads(*of))
+    unmodelled = [*inputs.lasting_jumps(given, options)]
+    drift: list[str] = []
+    # Errors of the data would look like changes.
+    if not (mistakes or unmodelled):
+        for changed, sentence in diagnosis.changing_friction(*of):
+            (drift if changed == "friction" else unmodelled).append(sentence)
+        unmodelled += diagnosis.loose_loads(*of)
     found = (
         *named,
         *drift,
-        *play,
+        *unmodelled,
         *((inputs.ZEROED_PER_RECORDING,) if guessed else ()),
         *inputs.data_warnings(plant, given, joint, moved, options),
     )
     measurement = inputs.measurement_matrix(plant, convention)
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
-        found, tuple(m.text for m in mistakes), drift, play,
+        found, tuple(m.text for m in mistakes), tuple(drift), tuple(unmodelled),
     )  # fmt: skip
 
 

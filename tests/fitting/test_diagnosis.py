@@ -204,9 +204,32 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
     motions = [kalman_smoother(recording.time, recording.q)]
     said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
     assert len(said) == (fall > 0)
-    for sentence in said:
+    for changed, sentence in said:
+        assert changed == "friction"
         found, within = re.search(r"falls by (\S+) ± (\S+) %", sentence).groups()
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
+
+
+@pytest.mark.parametrize("drift", [0.0, 1.0, -1.0])
+def test_an_offset_of_a_force_sensor_that_drifts_is_named(drift):
+    """Of at most a twelfth of the friction."""
+    rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
+    phase, rng = rate * time, np.random.default_rng(0)
+    q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)
+    q, qd, qdd = (x.sum(1, keepdims=True) for x in (q, qd, qdd))
+    tau = 3.5 * qdd + 12 * np.sign(qd) + 15 * qd + drift * time / time[-1]
+    q += 1e-5 * rng.normal(size=q.shape)
+    tau += 0.1 * rng.normal(size=q.shape)
+    recording = Recording(time[:, 0], q, tau, unit="m")
+    motions = [kalman_smoother(recording.time, recording.q)]
+    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert [changed for changed, _ in said] == ["offset"] * (drift != 0)
+    for _, sentence in said:
+        way, found, within = re.search(
+            r"The offset of the force of joint1 (\w+) by (\S+) ± (\S+) N during", sentence
+        ).groups()
+        assert way == ("grows" if drift > 0 else "falls")
+        assert abs(float(found) - abs(drift)) < float(within) + 0.05 < 0.2
 
 
 # If a friction changes its sign, something else has changed.
@@ -219,8 +242,8 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
     """With another motion in each."""
 
     def growth(*given):
-        found, squares = estimated(*given)
-        return rate or found, squares
+        found, *others = estimated(*given)
+        return rate or found, *others
 
     estimated = diagnosis._growth
     monkeypatch.setattr(diagnosis, "_growth", growth)
@@ -239,7 +262,7 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
     said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
     assert len(said) == named
-    for sentence in said:
+    for _, sentence in said:
         numbers = re.search(r"grows by (\S+) ± (\S+) % in run2 relative to", sentence)
         found, within = map(float, numbers.groups())
         assert abs(found - 30) < within < 5
@@ -828,11 +851,13 @@ def test_a_spike_is_named_with_its_time(rounded):
 def test_lost_counts_and_missing_samples_are_named_with_their_time():
     plant, q, tau = measured("driven")
     (found,) = (w for w in warnings_of(plant, q + (q * 0 + [0, 0.3]) * LATER, tau) if "good" in w)
-    assert "joint2 jumps for good at 2 s:" in found
+    assert "joint2 of a recording jumps for good at 2 s:" in found
     # A logger writes the nominal time.
     kept = np.r_[0:1000, 1030 : len(q)]
     found = warnings_of(plant, q[kept], tau[kept], time=STEP * np.arange(len(kept)))
     assert any("jumps for good at 2 s:" in warning for warning in found)
+    # Positions that jump look like friction that changes.
+    assert not any("friction of" in warning for warning in found)
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
@@ -850,6 +875,22 @@ def test_torques_of_a_wrong_scale_are_named(name):
     recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(0.5,))
     assert any("torques are recorded 1.2 times as large as they are" in w for w in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("scale", "inertia", "named"), [(1.15, 1.06, True), (1.0, 1.08, False), (1.0, 1.25, False)]
+)
+def test_a_scale_of_the_torques_is_named_although_the_rig_errs(scale, inertia, named):
+    """Only a common change of inertia and gravity beyond that of the usual rig."""
+    plant, q, tau = measured("direct")
+    recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
+    wrong = plant.replace(inertia_coupling=plant.inertia_coupling / inertia)
+    found = fit(CVFM(1), wrong, recording, windows=(0.5,))
+    said = [w for w in found.warnings if "torques are recorded" in w]
+    assert len(said) == named
+    for text in said:
+        assert re.search(r"are on average 1\.1[78]\d* times those of the rig", text)
+        assert found.usability[0] == "doubtful"
 
 
 def test_a_step_at_a_gap_is_no_spike():

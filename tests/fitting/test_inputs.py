@@ -166,14 +166,14 @@ def test_the_fall_by_heat_is_recovered() -> None:
 
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
 def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs, monkeypatch):
-    falls = ["The friction of joint1 falls by 30 %."]
+    falls = [("friction", "The friction of joint1 falls by 30 %.")]
     monkeypatch.setattr("nfriction.fitting.diagnosis.changing_friction", lambda *_: falls)
     recording = swing(pendulum(), truth("heat"), seconds=3.0)
     law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
     assert "falls by 30 %" in law.usability[1]
     model = NFCVFM(2, v_smooth=V_SMOOTH, inputs=inputs)
     found = fit(model, pendulum(), recording, start=law, max_steps=1, **BRIEF)
-    assert (falls[0] in found.warnings) == (not inputs)
+    assert (falls[0][1] in found.warnings) == (not inputs)
     assert ("falls by 30 %" in found.usability[1]) == (not inputs)
 
 

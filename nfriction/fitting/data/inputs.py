@@ -532,12 +532,25 @@ def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iter
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples far from both neighbours, on the same side, and permanent jumps."""
+    """Single samples far from both neighbours, on the same side."""
     for recording in recordings:
-        q, time = recording.q, recording.time
-        far, least = _far_samples(q, options)
-        # Steps far above both adjacent steps, which are similar; across a gap any step is possible.
-        steps, heights = np.diff(q, axis=0), []
+        far, _ = _far_samples(recording.q, options)
+        for name, peak in zip(recording.names, far.T, strict=True):
+            if peak.any():
+                yield (
+                    f"{recording.name or 'A recording'}: {name} jumps for one sample at "
+                    f"{_times(recording.time[1:-1][peak])}; such spikes are errors of the sensor, "
+                    "leave these samples out."
+                )
+
+
+def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
+    """Steps of a position far above both adjacent steps, which are similar."""
+    for recording in recordings:
+        time, heights = recording.time, []
+        _, least = _far_samples(recording.q, options)
+        # Across a gap any step is possible.
+        steps = np.diff(recording.q, axis=0)
         steps[gaps(time)] = np.nan
         # Also if scaled to equal length: either the samples or their time stamps may jitter.
         for step in (steps, steps * (recording.sample_time / np.diff(time))[:, None]):
@@ -545,14 +558,7 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
             high = np.minimum(np.abs(at - before), np.abs(at - after))
             heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
         height = np.minimum(*heights)
-        lasting = height > least
-        for name, peak, jump, high in zip(recording.names, far.T, lasting.T, height.T, strict=True):
-            of = f"{recording.name or 'A recording'}: {name} jumps"
-            if peak.any():
-                yield (
-                    f"{of} for one sample at {_times(time[1:-1][peak])}; such spikes are errors of "
-                    "the sensor, leave these samples out."
-                )
+        for name, jump, high in zip(recording.names, (height > least).T, height.T, strict=True):
             if not jump.any():
                 continue
             cause = "samples are missing without a gap in time, or the encoder lost counts or froze"
@@ -561,7 +567,8 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
             if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
                 cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
                 remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
-            yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
+            where = f"{name} of {recording.name or 'a recording'} jumps"
+            yield f"{where} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
 
 
 def _far_samples(

@@ -140,9 +140,9 @@ def result_from_shooting(
     # Their bound is a matter of chance.
     vague = {i.name for i in intervals if i.low <= ends[i.name][0] and i.high >= ends[i.name][1]}
     favoured = [name for name in at_bounds if name not in vague]
-    scaled = scale_warning(problem, intervals)
-    rig, far = rig_warning(problem, intervals)
-    mistakes = lossless_motion(problem, at_zero) if residual > limit * noise else ()
+    incomplete = residual > limit * noise
+    scaled, far = scale_warning(problem, intervals, incomplete)
+    mistakes = lossless_motion(problem, at_zero) if incomplete else ()
     return FitResult(
         model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
@@ -159,7 +159,7 @@ def result_from_shooting(
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
         mistakes=mistakes,
-        unmodelled=scaled + rig * far,
+        unmodelled=scaled * far,
         warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)
         + identifiability.warnings_of(
             converged=result.converged, at_bounds=favoured, unidentifiable=unidentifiable,
@@ -168,8 +168,8 @@ def result_from_shooting(
         + identifiability.model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
-        + (scaled or (PROPORTIONAL,) * (not problem.windows.tau.any()))
-        + rig
+        + scaled
+        + (PROPORTIONAL,) * (not problem.windows.tau.any())
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),
@@ -203,56 +203,59 @@ def lossless_motion(problem: ShootingProblem, at_zero: Sequence[str]) -> tuple[s
     )
 
 
-def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """A sentence if a driven rig seems heavier or lighter as a whole."""
-    found = list(_relative_weights(problem.jacobian.plant, intervals))
-    if len(found) < 2 or not problem.windows.tau.any():
-        return ()
-    scale = sum(found) / len(found)
-    # Like a delay, a scale matters if it takes a coefficient of torque out of its interval.
-    # Networks have no such intervals.
-    law, least = problem.friction.law.coefficients, problem.options.gain_term[1]
-    of_torque = tuple(f"{c.name} of" for c in law if c.unit.startswith("N"))
-    friction = [i for i in intervals if i.name.startswith(of_torque)]
-    out = any(not i.low <= i.value / (1 + scale) <= i.high for i in friction)
-    matters = out if friction else abs(scale) >= least
-    if not (matters and all(abs(x - scale) < ALIKE * abs(scale) for x in found)):
-        return ()
-    return (
-        f"Inertia and gravity are both {1 + scale:.4g} times those of the rig. Either its masses "
-        f"are wrong, or torques are recorded {1 + scale:.4g} times as large as they are (torque "
-        "constant, gear ratio, unit); then so is the friction.",
-    )
-
-
-def rig_warning(
-    problem: ShootingProblem, intervals: Sequence[Interval]
+def scale_warning(
+    problem: ShootingProblem, intervals: Sequence[Interval], incomplete: bool
 ) -> tuple[tuple[str, ...], bool]:
-    """A sentence if the fit changes the rig by more than its data usually err, and friction too.
+    """A sentence if the fit scales the rig, and with it friction; true if that makes it doubtful.
 
-    More is beyond the prior's standard deviation; the flag is true beyond 95 % of the prior. With
-    recorded torques, friction follows such an error only beside a single inertia or mass.
+    The terms of a driven rig are scaled if all change alike and friction leaves its interval, or if
+    the change that they share exceeds what is their own, and 95 % of the prior. A single term, or
+    one of a free rig, is named beyond the prior's standard deviation, and doubtful beyond 95 %.
+    `incomplete` is true if the residual contains errors of the model.
     """
     plant, driven = problem.jacobian.plant, bool(problem.windows.tau.any())
+    sd = problem.options.ratio_term[1]
+    usual = identifiability.NORMAL_95 * sd
     weights = [
         i for i in intervals
         if i.name.startswith(("inertia", "gravity", "mass")) and i.low * i.high > 0
     ]  # fmt: skip
-    if driven and len([*_relative_weights(plant, intervals)] or weights) > 1:
-        return (), False
-    sd = problem.options.ratio_term[1]
-    worst = max(weights, key=lambda i: abs(i.value), default=None)
-    if worst is None or abs(worst.value) <= sd:
-        return (), False
-    term, _, place = worst.name.partition(" ")
-    joint, scale = plant.joint_names[int(place[0]) - 1 + plant.first_link], 1 + worst.value
-    text = f"The {term} of {joint} is {scale:.3g} times that of the rig. " + (
-        f"Either the rig is wrong, or torques are recorded {scale:.3g} times as large as they are "
-        "(torque constant, gear ratio, unit); then so is the friction." if driven else
-        "The masses, inertias and centres of mass of the rig do not agree with the motion; the "
-        "friction is in proportion to them."
-    )  # fmt: skip
-    return (text,), abs(worst.value) > identifiability.NORMAL_95 * sd
+    changes = list(_relative_weights(plant, intervals))
+    cause = "the rig is wrong, or torques are recorded {0} times as large as they are (torque "
+    cause += "constant, gear ratio, unit); then so is the friction."
+    if driven and len(changes or weights) > 1:
+        change = sum(changes) / len(changes or weights)
+        shared, own = len(changes) * change**2, sum((x - change) ** 2 for x in changes)
+        # Like a delay, a scale matters if it takes a coefficient of torque out of its interval.
+        # Networks have no such intervals.
+        law, least = problem.friction.law.coefficients, problem.options.gain_term[1]
+        of_torque = tuple(f"{c.name} of" for c in law if c.unit.startswith("N"))
+        friction = [i for i in intervals if i.name.startswith(of_torque)]
+        out = any(not i.low <= i.value / (1 + change) <= i.high for i in friction)
+        matters = out if friction else abs(change) >= least
+        alike = matters and all(abs(x - change) < ALIKE * abs(change) for x in changes)
+        if not alike and shared <= max(own, usual**2):
+            return (), False
+        scale, far = f"{1 + change:.4g}", True
+        found = f"Inertia and gravity are {'both' if alike else 'on average'} {scale} times those"
+    else:
+        worst = max(weights, key=lambda i: abs(i.value), default=None)
+        if worst is None or abs(worst.value) <= sd:
+            return (), False
+        term, _, place = worst.name.partition(" ")
+        joint = plant.joint_names[int(place[0]) - 1 + plant.first_link]
+        scale, far = f"{1 + worst.value:.3g}", abs(worst.value) > usual
+        found = f"The {term} of {joint} is {scale} times that"
+        if not driven:
+            cause = (
+                "the masses, inertias and centres of mass of the rig do not agree with the motion; "
+                "the friction is in proportion to them."
+            )
+    if incomplete:
+        cause = f"The law lacks something, which may have changed this; or {cause}"
+    else:
+        cause = f"Either {cause}" if driven else cause.capitalize()
+    return (f"{found} of the rig. {cause.format(scale)}",), far
 
 
 def rotor_warning(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms
+from nfriction.fitting.data.inputs import adjustable_terms, weighs
 from nfriction.fitting.equation_error import TorqueFit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
@@ -105,6 +105,8 @@ def fit_constant(task: FitTask) -> FitResult:
     )
     skipped = f"Windows of {' and '.join(f'{length:g}' for length in search.skipped)} s"
     why = SKIPPED.get(search.reason)
+    if search.reason == "too long" and task.plant.joints == 1 and not weighs(task.plant):
+        why = "law, plant or torques are wrong"  # nothing is chaotic there
     said = [f"{skipped} were skipped: {why}."] if why else []
     if search.reason == "noisy":
         noisy = f"{skipped} were not needed: over them noise of the torque adds up"
