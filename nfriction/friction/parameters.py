@@ -170,7 +170,8 @@ class Sensitivity:
             constant = mix.stride(0) == features.stride(0) == 0  # over the samples
             left, right = mixed[id(mix)], features.unflatten(0, (blocks, samples)).transpose(1, 2)
             if features.ndim == 3:
-                left, right = left.mT, right.unsqueeze(2)
+                # Features lie one after another for each sample, as the products read them.
+                left, right = left.mT, right.contiguous().unsqueeze(2)
             elif constant:
                 left, right = left.sum(3), right[0, :, 0]
             else:

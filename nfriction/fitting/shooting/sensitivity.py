@@ -32,6 +32,8 @@ CHUNK = 1024
 # Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
 # products, few enough for the processor's cache.
 PIECE = 2000
+# Derivatives of states that are carried through time together.
+CARRIED = 2**17
 
 
 class StepJacobian:
@@ -167,7 +169,8 @@ def propagate(
     carried[:, own:, friction_count:shared] = by_plant[..., :plant_count]
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
-    sample = 0
+    # Memory that is used again costs less than new memory.
+    room, sample = carried.new_empty(windows * max(1, many // block), own + joints, shared), 0
     # Steps after the last whole block form a shorter block.
     for first, last in pairwise(sorted({*range(0, whole, many), whole, steps})):
         length = min(block, last - first)
@@ -180,7 +183,8 @@ def propagate(
         slope = replace(slope, factors=tuple) if states else slope
         derivative = jacobian.after_step(before, held, tau, step, run.plant_vector)
         by_state, by_shared = (
-            part.unflatten(0, (-1, windows)) for part in _compose(slope, derivative, length, counts)
+            part.unflatten(0, (-1, windows))
+            for part in _compose(slope, derivative, length, counts, room)
         )
         rows, carried = _carry(by_state, by_shared, carried, joints)
         end = sample + stride * rows.shape[1]
@@ -208,12 +212,12 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity, derivative: Tensor, block: int, counts: tuple[int, int]
+    slope: Sensitivity, derivative: Tensor, block: int, counts: tuple[int, int], room: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
     Returns derivatives of the ends of blocks with respect to the state before and shared variables,
-    of which `counts` are of friction and plant.
+    of which `counts` are of friction and plant; these are in `room`.
     """
     samples, joints, k = slope.qd.shape
     own = derivative.shape[-2] - joints
@@ -234,7 +238,7 @@ def _compose(
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
-    shared = total.new_empty(*total.shape[:-1], sum(counts))
+    shared = room[: len(total)]
     by_friction, by_terms = shared.split(counts, -1)
     slope.contract(by_coefficient, by_friction)
     by_terms.copy_(total)
@@ -247,15 +251,18 @@ def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tu
     Returns the first `count` rows before every map, and all rows after the last.
     """
     # For thousands of products of small matrices NumPy's overhead is a fifth of torch's.
-    state, shared = by_state.numpy(), by_shared.numpy()
-    before = start.numpy().copy()
-    after = np.empty_like(before)
-    rows = np.empty((len(before), len(state), count, before.shape[-1]))
+    state, shared, end = by_state.numpy(), by_shared.numpy(), start.numpy().copy()
+    rows = np.empty((len(end), len(state), count, end.shape[-1]))
+    # Some windows at a time through all maps, few enough for the processor's cache.
+    some = max(1, CARRIED // end[0].size)
     # The search rejects a step at which derivatives overflow; a warning would be noise.
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(len(state)):
-            rows[:, k] = before[:, :count]
-            np.matmul(state[k], before, out=after)
-            after[..., : shared.shape[-1]] += shared[k]
-            before, after = after, before
-    return torch.from_numpy(rows), torch.from_numpy(before)
+        for first in range(0, len(end), some):
+            part = slice(first, first + some)
+            before = end[part]
+            for k in range(len(state)):
+                rows[part, k] = before[:, :count]
+                before = state[k, part] @ before
+                before[..., : shared.shape[-1]] += shared[k, part]
+            end[part] = before
+    return torch.from_numpy(rows), torch.from_numpy(end)
