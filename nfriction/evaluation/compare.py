@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -443,6 +443,10 @@ def compare(
                     scored(r, initial_state=states.get(r.name), **how) for r in recordings
                 ]
         progress.done()
+    named = [name for name, fit in fits.items() if fit is best]
+    known = {text.partition(":")[0] for text in warned}
+    train_scores, test_scores = (scores[part].get(named[0], []) for part in ("train", "test"))
+    warned += _warned(_worse_than_training(train_scores, test_scores, known, plant.unit))
     return Comparison(
         Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed, test_warnings=warned,
@@ -497,6 +501,32 @@ def _mistakes(
         yield from (f"{recording.name or 'test'}: {text}" for text in said)
 
 
+def _worse_than_training(
+    train: Sequence[Score], test: Sequence[Score], known: Container[str], unit: str
+) -> Iterator[str]:
+    """Tests that a fit does not follow, although it follows its training to the limit of the data.
+
+    Over the shortest windows, where errors of the fitted parameters hardly add up.
+    """
+
+    def missed(of: Score) -> tuple[float, float, str]:
+        over, error = next(iter(of.windows.items()), ("", of.free_run))
+        limit = of.limit and (of.limit.windows[over] if over else of.limit.free_run)
+        ratio = error.all / limit.all if limit and limit.all > 0 else math.nan
+        return ratio, error.all, f"over {over} s" if over else "in the free run"
+
+    usual, most = max((missed(of)[0] for of in train), default=math.nan), DEFAULTS.model_error_ratio
+    for of in test if usual <= most else ():
+        ratio, error, over = missed(of)
+        if of.recording not in known and ratio > most * max(usual, 1.0):
+            yield (
+                f"{of.recording or 'test'}: the best fit errs by {1e3 * error:.3g} m{unit} {over}, "
+                f"{ratio:.2g} times the limit of these data; in training by at most {usual:.2g} "
+                "times the limit: the motion is of another kind (speed, range, load), or rig, "
+                "friction or sensors have changed."
+            )
+
+
 def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
     """A sentence if tests are faster than all training, or move in a direction without training."""
     fastest, found = np.max([np.abs(m.qd).max(0) for m in train.motions], axis=0), []
@@ -532,8 +562,7 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
     Raises:
         ValueError: repeated names, or a recording in both parts, whatever its names.
     """
-    trained = {recording.digest() for recording in train}
-    seen = [r.name or "a recording" for r in test if r.digest() in trained]
+    seen = [r.name or "a recording" for r in test if any(_contains(t, r) for t in train)]
     if seen:
         raise ValueError(
             f"{', '.join(seen)}: used for training and testing; test a model on recordings that it "
@@ -546,6 +575,21 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
             f"recordings must have different names, {', '.join(repeated)} repeats; rename one, in "
             f"Python with the `name` of `Recording`."
         )
+
+
+def _contains(whole: Recording, part: Recording) -> bool:
+    """True if a recording is another one, or a piece of it, whatever their names and times."""
+    count = len(part)
+    last = len(whole) - count
+    if last < 0 or whole.joints != part.joints or (whole.tau is None) != (part.tau is None):
+        return False
+    whole_data, data = (
+        r.q if r.tau is None else np.concatenate([r.q, r.tau], axis=1) for r in (whole, part)
+    )
+    ends = (whole_data[: last + 1] == data[0]) & (whole_data[count - 1 :] == data[-1])
+    return any(
+        np.array_equal(whole_data[k : k + count], data) for k in np.flatnonzero(ends.all(axis=1))
+    )
 
 
 def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:

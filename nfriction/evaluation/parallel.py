@@ -113,7 +113,7 @@ def fit_models(
     turning = {}
     for part, (given, moved) in parts.items():
         joint = in_joint_coordinates(plant, given, plant.joints)
-        turning[part] = turning_velocity(plant, joint, moved)
+        turning[part], _ = turning_velocity(plant, joint, moved)
     try:
         for level in dependency_levels(origin):
             labels = {f"{part} {name}": (part, name) for part in parts for name in level}

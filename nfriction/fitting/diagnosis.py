@@ -9,8 +9,9 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -226,18 +227,22 @@ def unlike_training(
             shares.append(share)
         elif shares and math.inf > share > ratio * (usual := max(shares)):
             most = ratio * max(usual, _of_noise(plant, data, data.sd_of_mean))
-            rest, text = min(_causes(plant, data, tau_f, left), default=(math.inf, ""))
+            causes = _causes(plant, data, tau_f, left, options)
+            rest, text = min(causes, default=(math.inf, ""))
             if rest < most < share:
                 said = f"It differs from the training recordings: {text}. The model leaves "
                 said += f"{share:.2g} of its torque unexplained, after the correction {rest:.2g}, "
                 yield recording.name, Mistake(f"{said}and {usual:.2g} of theirs.", rest)
 
 
-def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[tuple[float, str]]:
-    """Unexplained share [-] with other friction, or a scaled or offset torque, and the change."""
+def _causes(
+    plant: Plant, data: _Data, tau_f: Tensor, left: Tensor, options: FitOptions
+) -> Iterator[tuple[float, str]]:
+    """Unexplained share [-] with other friction, torque or encoder zeros, and the change."""
     kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
     zero = ", or its encoder has another zero" * weighs(plant)
     own, tau = (data.moving * data.mean(x) for x in (tau_f, data.tau))
+    names, drives, grown, rest = plant.joint_names, data.driven, [], left.clone()
 
     def fitted(j: int, shapes: Tensor) -> tuple[Tensor, float]:
         part, rest = shapes @ (torch.linalg.pinv(shapes) @ left[:, j]), left.clone()
@@ -247,13 +252,15 @@ def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[
     def relative(part: Tensor, whole: Tensor) -> float:
         return float(part @ whole) / float(whole @ whole or math.inf)
 
-    for j, name in enumerate(plant.joint_names):
+    for j, name in enumerate(names):
         part, share = fitted(j, data.friction[:, j])
         times = 1 + relative(part, own[:, j])
         # A wrong sign has causes of its own.
         if times > 0:
             yield share, f"the friction of {name} is {times:.3g} times theirs"
-        if j in data.driven:
+            rest[:, j] -= part
+            grown.append(f"that of {name} {times:.3g} times theirs")
+        if j in drives:
             part, share = fitted(j, tau[:, [j]])
             true = 1 - relative(part, tau[:, j])
             if true > 0:
@@ -261,6 +268,18 @@ def _causes(plant: Plant, data: _Data, tau_f: Tensor, left: Tensor) -> Iterator[
             part, share = fitted(j, data.moving[:, [j]])
             size = relative(part, data.moving[:, j])
             yield share, f"the {kind} of {name} has an offset of {size:.3g} {unit}{zero}"
+    if len(grown) == len(names) > 1:
+        share = _share(plant, data, rest.square().mean(0))
+        yield share, f"every friction differs, {', '.join(grown)}"
+    # The torque of a drive shows an offset, too.
+    zeros, _ = _torques_of_terms(plant, data, options) if not drives else ([], [])
+    first = len(names) - len(zeros)
+    for name, slope in zip(names[first:], zeros, strict=True):
+        part = data.moving * data.mean(slope)
+        size = relative(left.flatten(), part.flatten())
+        share = _share(plant, data, (left - size * part).square().mean(0))
+        off = math.degrees(size)
+        yield share, f"the encoder of {name} has another zero, {abs(off):.2g} degrees off"
 
 
 def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:
@@ -514,6 +533,7 @@ def _corrected_positions(
     names, first, joints = plant.joint_names, plant.first_link, plant.joints
     chain = isinstance(plant, PendulumChain)
     eye, none = np.eye(joints), np.zeros(joints)
+    kind = "force" if plant.unit == "m" else "torque"
 
     def recorded(
         matrix: Array, offset: Array = none, reading: AngleConvention = convention
@@ -532,7 +552,11 @@ def _corrected_positions(
 
     for j, name in enumerate(names):
         own = np.diag(eye[j])
-        yield f"the sign of {name}'s position is reversed", recorded(eye - 2 * own)
+        mirrored = recorded(eye - 2 * own)
+        yield f"the sign of {name}'s position is reversed", mirrored
+        if joints > 1 and j in given.driven:
+            text = f"the signs of {name}'s position and {kind} are reversed"
+            yield text, replace(mirrored, tau=given.tau * torch.as_tensor(1 - 2 * eye[j]))
         # The counts of an encoder's revolution, in quadrature or not.
         for factor in (0.25, 0.5, 2.0, 4.0):
             text = f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
@@ -555,7 +579,9 @@ def _corrected_positions(
     if chain and joints - first > 1:
         angles: Angles = "relative" if convention.angles == "absolute" else "absolute"
         other = AngleConvention(angles, convention.measured_from)
-        text = f"angles are {angles}, not {convention.angles} (`convention`)"
+        # Motors turn their joints, so a convention cannot make their angles absolute.
+        remedy = "`convention`" if plant.motor is None else "of a belt: convert the motor's columns"
+        text = f"angles are {angles}, not {convention.angles} ({remedy})"
         yield text, recorded(eye, reading=other)
     for i in range(joints):
         for j in range(i + 1, joints):
@@ -679,7 +705,7 @@ def _corrected_torques(
     for j in driven:
         tau = given.tau[:, j]
         # If gravity requires only one sign, this changes nothing.
-        if bool((tau >= 0).all() or (tau <= 0).all()):
+        if bool((tau >= 0).all() or (tau <= 0).all()) and tau.min() < tau.max():
             signed = given.tau.clone()
             signed[:, j] = tau.abs() * torch.sign(needed[:, j])
             text = f"the {kind} of {plant.joint_names[j]} is recorded without its sign"
@@ -806,7 +832,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[tuple[str, str]]:
-    """Joints whose friction, or offset of a drive, changes with time: which, and a sentence.
+    """Joints whose friction, or a drive's scale or offset, changes with time: which, a sentence.
 
     Changes may happen during recordings or between them. For the arguments see `likely_mistakes`. A
     wrong law, rig or delay must not appear as a change: friction may be any function of speed plus
@@ -821,14 +847,13 @@ def changing_friction(
     # At a constant rate, or as a warm-up of which 95 % is over at the end.
     during = [("during a recording", x) for x in (time, 1 - torch.exp(-3 * time / time.max()))]
     onward = "from the first recording to the last", number
-    kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
     for j, joint in enumerate(plant.joint_names):
         *means, sliding = _of_sliding(plant, data, j, options)
         friction, of_rig, torque = (x[sliding] for x in means)
         terms = friction, of_rig, torque
         if (count := len(friction)) < 2 * pieces or not bool(torch.cat(terms, 1).isfinite().all()):
             continue
-        kinds = ["friction", "offset"] if j in data.driven else ["friction"]
+        kinds = ["friction", "scale", "offset"] if j in data.driven else ["friction"]
         piece, between = torch.arange(count) * pieces // count, [onward]
         if len(recordings) > 2:
             # The recording whose friction differs most from that of the others.
@@ -838,47 +863,70 @@ def changing_friction(
             name = names_of(recordings)[odd]
             between.append((f"in {name} relative to the others", alone[odd]))
         # Between recordings, a gain that differs between directions would look like an offset.
-        for clocks, shown in ((during, kinds), (between, kinds[:1])):
-            tried = []
+        for clocks, shown in ((during, kinds), (between, kinds[:2])):
+            tried: list[_Change] = []
             # Per time of sliding, in pieces that all contain some: rest shows nothing.
-            for (period, whole), changed in product(clocks, shown):
+            for (period, whole), of in product(clocks, shown):
                 clock = whole[sliding]
                 span = clock.max() - clock.min()
                 if span == 0:
                     continue
                 given = [*terms, clock / span]
-                found = [_growth(changed, piece == k, *given) for k in range(pieces)]
+                found = [_growth(of, piece == k, *given) for k in range(pieces)]
                 rates, squares, _ = zip(*found, strict=True)
                 constant, growing = torch.stack(squares).T
                 mean = float((clock - clock.min()).mean() / span)
-                change, _, size = _growth(changed, piece < 0, *given)
-                # No friction changes its sign; an exponential may fit where a line does not.
-                if changed == "offset" or (change * (1 - mean) > -1 and change * mean < 1):
-                    of = growing, constant, np.var(rates), change, mean, period, changed, size
-                    tried.append(of)
+                rate, _, size = _growth(of, piece < 0, *given)
+                sd = math.sqrt((pieces - 1) * np.var(rates))
+                # Nothing changes its sign; an exponential may fit where a line does not.
+                if of == "offset" or (rate * (1 - mean) > -1 and rate * mean < 1):
+                    change = _Change(of, period, rate, sd, mean, size, growing, constant)
+                    tried.append(change)
             if not tried:
                 continue
-            best = min(tried, key=lambda x: float(x[0].sum()))
-            growing, constant, variance, rate, mean, period, changed, size = best
-            sd = math.sqrt((pieces - 1) * variance)
-            least = sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
-            least = max(0.01, least)  # a change of 1 % hardly shows in a simulation
-            if abs(rate) <= least or not improves(growing, constant, options.drift_chance):
-                continue
-            sd *= student_quantile(pieces - 1, 0.975)
-            if changed == "offset":
-                change, reach = (float(f"{abs(x) * size:.2g}") for x in (rate, sd))
-                what = f"offset of the {kind} of {joint}"
-                cause = f"{change:g} ± {reach:g} {unit} {period} (sensor, amplifier)"
-            else:
-                first, last = 1 - rate * mean, 1 + rate * (1 - mean)
-                ratio, slope = last / first, (1 - mean) / last + mean / first
-                change, reach = (100 * abs(ratio - 1), 100 * sd * ratio * slope)
-                change, reach = (float(f"{x:.2g}") for x in (change, reach))
-                what = f"friction of {joint}"
-                cause = f"{change:g} ± {reach:g} % {period} (warm-up, payload)"
-            way = "grows" if rate > 0 else "falls"
-            yield changed, f"The {what} {way} by {cause}; the intervals do not cover this."
+            best, *_ = tried = sorted(tried, key=lambda x: float(x.growing.sum()))
+            # Friction is what usually changes.
+            usual = next((x for x in tried if x.of == "friction"), best)
+            if not improves(best.growing, usual.growing, options.drift_chance):
+                best = usual
+            # A change of 1 % hardly shows in a simulation.
+            least = best.sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
+            if abs(best.rate) > max(0.01, least) and improves(
+                best.growing, best.constant, options.drift_chance
+            ):
+                yield best.of, best.sentence(plant, joint, student_quantile(pieces - 1, 0.975))
+
+
+class _Change(NamedTuple):
+    """A change with time of a joint's friction, of its torque's scale, or of an offset."""
+
+    of: str
+    period: str
+    rate: float  # over the period, relative to the friction or torque [-]
+    sd: float  # of the rate
+    mean: float  # of the time in the period [-]
+    size: float  # of the friction, root mean square [N m; N]
+    growing: Tensor  # squared torque errors of hold-out pieces with the change
+    constant: Tensor  # and without
+
+    def sentence(self, plant: Plant, joint: str, sure: float) -> str:
+        """In words, with an interval of this many standard deviations."""
+        kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
+        first, last = 1 - self.rate * self.mean, 1 + self.rate * (1 - self.mean)
+        slope = ((1 - self.mean) / last + self.mean / first) * last / first
+        if self.of == "offset":
+            what, cause, unit = f"offset of the {kind}", "sensor, amplifier", f" {unit}"
+            sizes = abs(self.rate) * self.size, sure * self.sd * self.size
+        else:
+            what, cause, unit = "friction", "warm-up, payload", " %"
+            sizes = 100 * abs(last / first - 1), 100 * sure * self.sd * slope
+            if self.of == "scale":
+                what, cause = f"scale of the {kind}", "torque constant, sensor, supply"
+        change, reach = (float(f"{x:.2g}") for x in sizes)
+        return (
+            f"The {what} of {joint} {'grows' if self.rate > 0 else 'falls'} by {change:g} ± "
+            f"{reach:g}{unit} {self.period} ({cause}); the intervals do not cover this."
+        )
 
 
 def loose_loads(
@@ -961,9 +1009,9 @@ def _of_sliding(plant: Plant, data: _Data, j: int, options: FitOptions) -> tuple
 
 
 def _growth(
-    changed: str, left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
+    of: str, left_out: Tensor, friction: Tensor, of_rig: Tensor, torque: Tensor, time: Tensor
 ) -> tuple[float, Tensor, float]:
-    """Growth of the friction, or of an offset, per unit of time, relative to the friction [-].
+    """Growth per unit of time, relative to the friction or, of the torque's scale, to the torque.
 
     From the terms of friction and of the rig, (block, term) each, that explain the torque. Also
     returns the sums of squared torque errors without and with the growth on hold-out blocks, and
@@ -973,8 +1021,8 @@ def _growth(
     constant = torch.linalg.lstsq(known[seen], torque[seen], driver="gelsd").solution
     usual = friction @ constant[: friction.shape[1]]
     size = usual.square().mean().sqrt()
-    growing = (time - time[seen].mean()) * (usual if changed == "friction" else size)
-    terms = torch.cat([known, growing], 1)
+    shape = {"friction": usual, "scale": known @ constant, "offset": size}[of]
+    terms = torch.cat([known, (time - time[seen].mean()) * shape], 1)
     found = torch.linalg.lstsq(terms[seen], torque[seen], driver="gelsd").solution
     missed = [torque - known @ constant, torque - terms @ found]
     squares = torch.stack([x[left_out].square().sum() for x in missed])
@@ -1034,24 +1082,34 @@ def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
 
 
 def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator[tuple[str, float]]:
-    """Each joint, and all, as if recorded at the motor, before a gear of the best ratio."""
+    """Each joint, and all, as if recorded at the motor, before a gear of the best ratio.
+
+    If the rig has motors, also each driven joint with the ratio of its gear that explains most.
+    """
     if not isinstance(plant, PendulumChain) or not given.tau.any():
         return
     first, eye = plant.first_link, np.eye(plant.joints)
     q = convention.position_from_joint(given.q.numpy(), first)
     rates = [convention.rate_from_joint(x.numpy(), first) for x in (given.qd, given.qdd)]
+
+    def geared(x: float, group: Array, drive: Array) -> float:
+        scale = np.exp(-x * group)
+        at = torch.as_tensor(convention.position_to_joint(q * scale, first))
+        qd, qdd = (torch.as_tensor(convention.rate_to_joint(r * scale, first)) for r in rates)
+        gain = torch.as_tensor(np.exp(x * drive))
+        data = replace(given, q=at, qd=qd, qdd=qdd, tau=given.tau * gain)
+        return _unexplained(plant.replace(armature=plant.armature * gain.square()), data)
+
     every = [("all positions are", eye.sum(0))] * (plant.joints > 1)
     alone = [(f"{name}'s position is", eye[j]) for j, name in enumerate(plant.joint_names)]
     for what, group in (*alone, *every):
-
-        def left(x: float, group: Array = group) -> float:
-            scale = np.exp(-x * group)
-            at = torch.as_tensor(convention.position_to_joint(q * scale, first))
-            qd, qdd = (torch.as_tensor(convention.rate_to_joint(r * scale, first)) for r in rates)
-            return _unexplained(plant, replace(given, q=at, qd=qd, qdd=qdd))
-
-        ratio, share = _best(left, *LOG_RATIOS, 41)
+        ratio, share = _best(partial(geared, group=group, drive=0 * group), *LOG_RATIOS, 41)
         yield f"{what} {math.exp(ratio):.3g} times too large (of the motor, before its gear)", share
+    for j in given.driven if plant.motor is not None else ():
+        most = LOG_RATIOS[1] / 4
+        ratio, share = _best(partial(geared, group=eye[j], drive=eye[j]), -most, most, 17)
+        name = plant.joint_names[j]
+        yield f"the gear ratio of {name} is {math.exp(ratio):.3g} times that of the rig", share
 
 
 def balanced_delay(

@@ -44,6 +44,7 @@ class FitTask:
     mistakes: tuple[str, ...] = ()
     drift: tuple[str, ...] = ()  # those of `data_warnings` on changes of friction
     unmodelled: tuple[str, ...] = ()  # those on other effects that no law describes
+    smoothed: str = ""  # a warning of a wide smoothed sign, for residuals above the noise
 
 
 def prepare_task(
@@ -70,8 +71,10 @@ def prepare_task(
     given = given if motions else inputs.released(given)
     joint = inputs.in_joint_coordinates(plant, given, model.joints)
     moved = inputs.smoothed_motions(joint, motions)
+    floor, wanted = inputs.turning_velocity(plant, joint, moved)
     if by_name:
-        model.v_smooth = inputs.turning_velocity(plant, joint, moved)
+        model.v_smooth = floor
+    blurred = model.v_smooth == floor > wanted
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
@@ -123,6 +126,7 @@ def prepare_task(
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, tuple(m.text for m in mistakes), tuple(drift), tuple(unmodelled),
+        inputs.SMOOTHED.format(floor, wanted) if blurred else "",
     )  # fmt: skip
 
 

@@ -24,9 +24,11 @@ from nfriction import (
     rollout,
 )
 from nfriction.fitting import diagnosis
+from nfriction.fitting.data import inputs
 from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
+from nfriction.fitting.strategy import constant
 from nfriction.fitting.task import prepare_task
 from nfriction.recording.validation import time_unit
 from nfriction.signals import kalman_smoother, quantise
@@ -88,6 +90,94 @@ def warnings_of(plant: Plant, q: np.ndarray, tau: np.ndarray | None, **given) ->
 
 def later(values: np.ndarray, samples: int) -> np.ndarray:
     return np.concatenate([np.repeat(values[:1], samples, 0), values[:-samples]])
+
+
+def test_a_motor_that_is_mounted_the_other_way_round_is_named():
+    plant, q, tau = measured("driven")
+    # From hanging, so that reversed signs are another motion.
+    hanging = (q - [math.pi, 0.0]) * [1, -1]
+    (found, *_) = warnings_of(plant, hanging, tau * [1, -1], convention="relative,hanging")
+    assert "the signs of joint2's position and torque are reversed" in found
+
+
+def test_a_wrong_gear_ratio_of_a_motor_is_named():
+    """Of angle and torque at once, which no other cause scales so."""
+    _, q, tau = measured("driven")
+    geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 40.0], torque_constant=0.1))
+    (found, *_) = warnings_of(geared, q * [1, 1 / 1.5], tau * [1, 1.5])
+    assert re.search(r"the gear ratio of joint2 is (0\.66|0\.67)\d* times that of the rig", found)
+
+
+def test_motors_in_the_base_are_named_with_a_remedy_for_motors():
+    _, q, tau = measured("driven")
+    absolute = np.cumsum(q, axis=1)
+    geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 40.0], torque_constant=0.1))
+    (found, *_) = warnings_of(geared, absolute, tau)
+    assert "angles are absolute, not relative (of a belt: convert the motor's columns)" in found
+
+
+def test_a_torque_of_coarse_steps_is_neither_clipped_nor_stuck():
+    plant, q, tau = measured("motor")
+    noisy = tau + 0.05 * np.random.default_rng(0).normal(size=tau.shape)
+    found = warnings_of(plant, q, 0.1 * np.round(noisy / 0.1))
+    assert any("the torque of joint1 has steps of 0.1, larger than its noise" in w for w in found)
+    assert not any("clipped" in w for w in found)
+
+
+def test_a_torque_that_turns_sharply_has_no_spike():
+    """As where friction takes over from a drive at rest."""
+    time = STEP * np.arange(SAMPLES)
+    tau = np.sin(2 * math.pi * 0.3 * time)
+    tau += 0.8 * np.abs(np.mod(time, 2.0) - 1.0)
+    recording = Recording(time, np.sin(time)[:, None], tau[:, None])
+    assert not any(inputs._torque_spikes([recording], FitOptions()))
+    spiked = replace(recording, tau=tau[:, None] + 0.5 * (np.arange(SAMPLES) == 700)[:, None])
+    assert len([*inputs._torque_spikes([spiked], FitOptions())]) == 1
+
+
+def test_a_gain_of_one_drive_beyond_the_usual_is_named():
+    plant, q, tau = measured("driven")
+    time, convention = STEP * np.arange(len(q)), "relative,upright"
+    recording = Recording(time, q, tau * [1.0, 1.25], convention=convention)
+    found = fit(CVFM(2), plant, recording, windows=(0.5,))
+    (text,) = (w for w in found.warnings if "Torques of joint2" in w)
+    assert re.search(r"recorded 1\.2[45]\d* times as large as those of the other joints", text)
+    assert found.usability[0] == "doubtful"
+
+
+def test_a_scale_of_the_torque_that_changes_is_no_change_of_friction():
+    rig, recordings, rng = LinearAxis(3.5), [], np.random.default_rng(0)
+    time = 0.004 * np.arange(2001)[:, None]
+    for number, fastest in enumerate((1.3, 1.7)):
+        wave = np.array([fastest, 2.3 * fastest])
+        q, qd, qdd = (
+            0.1 * (wave**k * np.sin(wave * time + 0.5 * k * math.pi)).sum(1, keepdims=True)
+            for k in range(3)
+        )
+        tau = (1 + 0.2 * number) * (3.5 * qdd + 2 * np.sign(qd) + 1 * qd)
+        tau += 0.02 * rng.normal(size=q.shape)
+        q = q + 1e-5 * rng.normal(size=q.shape)
+        recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
+    motions = [kalman_smoother(r.time, r.q) for r in recordings]
+    ((of, sentence),) = changing_friction(rig, recordings, motions, FitOptions())
+    assert of == "scale"
+    assert re.search(r"scale of the force of joint1 grows by (19|2[01])\.?\d* ± ", sentence)
+
+
+@pytest.mark.parametrize("reason", ["too long", "lossy"])
+def test_skipped_windows_of_a_single_free_link_blame_the_law(reason, monkeypatch):
+    """Its motion is not chaotic, and it has no torque whose errors could add up."""
+
+    def skipping(*given):
+        return replace(searched(*given), skipped=(2.0,), reason=reason)
+
+    searched = constant.horizon_continuation
+    monkeypatch.setattr(constant, "horizon_continuation", skipping)
+    rig = PendulumChain([0.5], [0.4], inertia=[0.0])
+    truth = CVFM(1, [[8e-3, 2e-3]], v_smooth=0.01).requires_grad_(False)
+    found = fit("CVFM", rig, swing(rig, truth, start=(1.5,)), windows=(0.5,))
+    assert "Windows of 2 s were skipped: law or plant are wrong." in found.warnings
+    assert found.usability == ("doubtful", "windows of 2 s were skipped, see warnings")
 
 
 @pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])

@@ -136,7 +136,7 @@ def test_a_joint_that_friction_holds_creeps_by_less_than_the_noise():
     recording = Recording(time, q, np.zeros_like(q))
     motion = kalman_smoother(time, recording.q)
     noise = np.std(q - motion.q)
-    found = turning_velocity(Rotor(1e-3), [recording], [motion])
+    found, _ = turning_velocity(Rotor(1e-3), [recording], [motion])
     assert 0.3 * noise < 0.4 * found <= noise
 
 

@@ -78,8 +78,8 @@ def require_doubles(model: torch.nn.Module, plant: torch.nn.Module) -> None:
 
 def turning_velocity(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion]
-) -> float:
-    """Width of the smoothed sign of the velocity [rad/s; m/s].
+) -> tuple[float, float]:
+    """Width of the smoothed sign of the velocity, and the smaller one to be wished [rad/s; m/s].
 
     A joint that friction holds creeps at about this velocity. It is a small share of the slowest
     joint's largest velocity; where a rig is driven or comes to rest, it moves no joint by more than
@@ -95,7 +95,8 @@ def turning_velocity(
     # Half the substeps, because coefficients may grow during the search.
     most = RK4_STABILITY * DEFAULTS.max_substeps / 2
     least = float(dry.max()) * max(r.longest_step for r in recordings) / most
-    return max(min(V_SMOOTH, TURN_SHARE * slowest, *held), least)
+    wanted = min(V_SMOOTH, TURN_SHARE * slowest, *held)
+    return max(wanted, least), wanted
 
 
 def _creep(recording: Recording, motion: Motion, joint: int) -> float:
@@ -393,6 +394,11 @@ ZEROED_PER_RECORDING = (
     "zeroed there, in an arbitrary pose; scores estimate it from the first second, which is not "
     'scored. If this is wrong: `encoder_reference="shared"`.'
 )
+SMOOTHED = (
+    "Dry friction is smoothed over velocities of ±{:.2g} instead of ±{:.2g}, because a steeper "
+    "sign needs more integration steps than a fit takes; this may cause errors above the noise. A "
+    "model with a smaller `v_smooth`, or recordings with a higher sample rate, avoid them."
+)
 # Density of steel [kg/m^3].
 STEEL = 7_850.0
 # Bound of the error of angles after conversions.
@@ -580,8 +586,11 @@ def _far_samples(
     """
     before, after = x[1:-1] - x[:-2], x[1:-1] - x[2:]
     near, other = np.sort(np.abs([before, after]), axis=0)
+    # Where a motion turns sharply, as from rest, the steps beside are as large.
+    steps = np.abs(np.pad(np.diff(x, axis=0), ((1, 1), (0, 0))))
+    alone = near > np.maximum(steps[:-3], steps[3:])
     # Steps, as at a gap in time, and samples next to a spike are far from only one neighbour.
-    height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
+    height = np.where((before * after > 0) & (2 * near > other) & alone, near, 0.0)
     curved = np.quantile(np.abs(before + after) / 2, 1 - most, axis=0)
     # A joint may show no count.
     least = options.spike_ratio * np.fmax(curved, count_seen(x))
@@ -620,6 +629,13 @@ def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
             first, third = (np.abs(np.diff(value, n=n)) for n in (1, 3))
             if len(third) < MINIMUM_SAMPLES or np.median(third) < np.median(first):
                 continue
+            of = f"{recording.name or 'A recording'}: the torque of {name}"
+            if (step := float(np.median(first))) < 1.5 * count_seen(torque[:, None])[0]:
+                yield (
+                    f"{of} has steps of {step:.3g}, larger than its noise; simulations err by more "
+                    "than that noise explains."
+                )
+                continue
             usual = length[length < MINIMUM_SAMPLES]
             same = (usual.sum() - len(usual)) / max(usual.sum(), 1)
             chance = math.log(UNLIKELY / len(torque)) / math.log(same) if same else 0
@@ -633,9 +649,8 @@ def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
             limits = " and ".join(f"{x:.3g}" for x in sorted(ends))
             where = f" at {limits}" if ends else f" from {_times(recording.time[edges[:-1]][held])}"
             yield (
-                f"{recording.name or 'A recording'}: the torque of {name} has noise, but does not "
-                f"change in {100 * share:.2g} % of the samples,{where}: its sensor is clipped or "
-                "stuck; leave these samples out."
+                f"{of} has noise, but does not change in {100 * share:.2g} % of the "
+                f"samples,{where}: its sensor is clipped or stuck; leave these samples out."
             )
 
 

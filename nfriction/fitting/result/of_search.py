@@ -142,6 +142,7 @@ def result_from_shooting(
     favoured = [name for name in at_bounds if name not in vague]
     incomplete = residual > limit * noise
     scaled, far = scale_warning(problem, intervals, incomplete)
+    gains = list(gain_warnings(problem, intervals))
     mistakes = lossless_motion(problem, at_zero) if incomplete else ()
     return FitResult(
         model=model.requires_grad_(False),
@@ -159,7 +160,7 @@ def result_from_shooting(
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
         mistakes=mistakes,
-        unmodelled=scaled * far,
+        unmodelled=scaled * far + tuple(text for text, wrong in gains if wrong),
         warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)
         + identifiability.warnings_of(
             converged=result.converged, at_bounds=favoured, unidentifiable=unidentifiable,
@@ -169,6 +170,7 @@ def result_from_shooting(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + scaled
+        + tuple(text for text, _ in gains)
         + (PROPORTIONAL,) * (not problem.windows.tau.any())
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
@@ -256,6 +258,23 @@ def scale_warning(
     else:
         cause = f"Either {cause}" if driven else cause.capitalize()
     return (f"{found} of the rig. {cause.format(scale)}",), far
+
+
+def gain_warnings(
+    problem: ShootingProblem, intervals: Sequence[Interval]
+) -> Iterator[tuple[str, bool]]:
+    """A sentence for each torque gain beyond its prior's standard deviation; true beyond 95 %."""
+    sd = problem.options.gain_term[1]
+    for one in intervals:
+        term, _, place = one.name.rpartition(" ")
+        if term == "torque gain" and one.low * one.high > 0 and abs(one.value) > sd:
+            joint = problem.jacobian.plant.joint_names[int(place) - 1]
+            text = (
+                f"Torques of {joint} are recorded {1 / (1 + one.value):.3g} times as large as "
+                "those of the other joints (torque constant, gear ratio, unit), and its friction "
+                "with them."
+            )
+            yield text, abs(one.value) > identifiability.NORMAL_95 * sd
 
 
 def rotor_warning(

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms, weighs
+from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.equation_error import TorqueFit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
@@ -104,21 +104,22 @@ def fit_constant(task: FitTask) -> FitResult:
         skipped_horizons=search.skipped,
     )
     skipped = f"Windows of {' and '.join(f'{length:g}' for length in search.skipped)} s"
+    driven = bool(found.problem.windows.tau.any())
     why = SKIPPED.get(search.reason)
-    if search.reason == "too long" and task.plant.joints == 1 and not weighs(task.plant):
-        why = "law, plant or torques are wrong"  # nothing is chaotic there
+    # Motion in two dimensions is not chaotic (Poincare, Bendixson), and no torque adds up errors.
+    wrong = bool(why) and task.plant.joints == 1 and not driven
+    why = "law or plant are wrong" if wrong else why
     said = [f"{skipped} were skipped: {why}."] if why else []
     if search.reason == "noisy":
         noisy = f"{skipped} were not needed: over them noise of the torque adds up"
         fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")
-    driven = bool(found.problem.windows.tau.any())
     if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
         rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
         delayed = _fitter(with_delay, model, torque, eccentric or rich)
         late, biased = delay_warning(found, delayed, fitted.intervals)
         fitted = fitted.with_warnings(late, unmodelled=late if biased else ())
-    return fitted.with_warnings(said)
+    return fitted.with_warnings(said, unmodelled=said if wrong else ())
 
 
 def _begin(task: FitTask, fitter: ShootingFitter, torque: TorqueFit) -> Tensor:
