@@ -115,14 +115,7 @@ def fit(
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     found = strategy(task)
-    of_data = task.data_warnings
-    if (
-        task.smoothed
-        and found.noise
-        and not task.mistakes
-        and found.residual > options.model_error_ratio * found.noise
-    ):
-        of_data = (*of_data, task.smoothed)
-    found = found.with_warnings(of_data, task.mistakes, (*task.drift, *task.unmodelled))
+    unmodelled = *task.drift, *task.unmodelled
+    found = found.with_warnings(task.warnings_beside(found), task.mistakes, unmodelled)
     # A law with heat explains friction that changes with time.
     return found.without(task.drift) if has_input(found.model.law, "heat") else found

@@ -1,6 +1,7 @@
 """The checked arguments of a fit, which every strategy takes."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +45,13 @@ class FitTask:
     mistakes: tuple[str, ...] = ()
     drift: tuple[str, ...] = ()  # those of `data_warnings` on changes of friction
     unmodelled: tuple[str, ...] = ()  # those on other effects that no law describes
-    smoothed: str = ""  # a warning of a wide smoothed sign, for residuals above the noise
+    smoothed: tuple[str, ...] = ()  # a warning of a wide smoothed sign
+
+    def warnings_beside(self, found: FitResult) -> tuple[str, ...]:
+        """Those about the data, and on a wide smoothed sign if the residual exceeds the noise."""
+        least = self.options.model_error_ratio * (found.noise or math.inf)
+        above = not self.mistakes and found.residual > least
+        return self.data_warnings + self.smoothed * above
 
 
 def prepare_task(
@@ -126,7 +133,7 @@ def prepare_task(
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, tuple(m.text for m in mistakes), tuple(drift), tuple(unmodelled),
-        inputs.SMOOTHED.format(floor, wanted) if blurred else "",
+        (inputs.SMOOTHED.format(floor, wanted),) * blurred,
     )  # fmt: skip
 
 
