@@ -443,10 +443,10 @@ def compare(
                     scored(r, initial_state=states.get(r.name), **how) for r in recordings
                 ]
         progress.done()
-    named = [name for name, fit in fits.items() if fit is best]
+    named = next(name for name, fit in fits.items() if fit is best)
+    of_best = [scores[part].get(named, []) for part in ("train", "test")]
     known = {text.partition(":")[0] for text in warned}
-    train_scores, test_scores = (scores[part].get(named[0], []) for part in ("train", "test"))
-    warned += _warned(_worse_than_training(train_scores, test_scores, known, plant.unit))
+    warned += _warned(_worse_than_training(*of_best, known=known, unit=plant.unit))
     return Comparison(
         Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed, test_warnings=warned,
@@ -502,7 +502,7 @@ def _mistakes(
 
 
 def _worse_than_training(
-    train: Sequence[Score], test: Sequence[Score], known: Container[str], unit: str
+    train: Sequence[Score], test: Sequence[Score], *, known: Container[str], unit: str
 ) -> Iterator[str]:
     """Tests that a fit does not follow, although it follows its training to the limit of the data.
 

@@ -583,14 +583,18 @@ def _corrected_positions(
         remedy = "`convention`" if plant.motor is None else "of a belt: convert the motor's columns"
         text = f"angles are {angles}, not {convention.angles} ({remedy})"
         yield text, recorded(eye, reading=other)
+    # Columns of motors are exchanged before their gears.
+    geared = plant.motor_factors
+    turn, torque = (np.array(geared.get(key, [1.0] * joints)) for key in ("motor", "current"))
     for i in range(joints):
         for j in range(i + 1, joints):
             order = np.arange(joints)
             order[[i, j]] = j, i
-            swapped, both = recorded(eye[order]), f"{names[i]} and {names[j]}"
+            swapped = recorded(eye[order] * (turn / turn[order])[:, None])
+            both = f"{names[i]} and {names[j]}"
             yield f"the positions of {both} are exchanged", swapped
             if given.tau.any():
-                tau = given.tau[:, order]
+                tau = given.tau[:, order] * torch.as_tensor(torque / torque[order])
                 yield f"the torques of {both} are exchanged", replace(given, tau=tau)
                 yield f"the columns of {both} are exchanged", replace(swapped, tau=tau)
 
@@ -1106,7 +1110,7 @@ def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator
         ratio, share = _best(partial(geared, group=group, drive=0 * group), *LOG_RATIOS, 41)
         yield f"{what} {math.exp(ratio):.3g} times too large (of the motor, before its gear)", share
     for j in given.driven if plant.motor is not None else ():
-        most = LOG_RATIOS[1] / 4
+        most = math.log(4.0)  # ratios within a series of gears
         ratio, share = _best(partial(geared, group=eye[j], drive=eye[j]), -most, most, 17)
         name = plant.joint_names[j]
         yield f"the gear ratio of {name} is {math.exp(ratio):.3g} times that of the rig", share

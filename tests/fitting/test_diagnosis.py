@@ -108,6 +108,16 @@ def test_a_wrong_gear_ratio_of_a_motor_is_named():
     assert re.search(r"the gear ratio of joint2 is (0\.66|0\.67)\d* times that of the rig", found)
 
 
+def test_exchanged_columns_of_motors_with_other_gears_are_named():
+    _, q, tau = measured("driven")
+    geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 30.0], torque_constant=[0.1, 0.2]))
+    factors = geared.motor_factors
+    motors, currents = q / factors["motor"], tau / factors["current"]
+    exchanged = motors[:, ::-1] * factors["motor"], currents[:, ::-1] * factors["current"]
+    (found, *_) = warnings_of(geared, *exchanged)
+    assert "the columns of joint1 and joint2 are exchanged" in found
+
+
 def test_motors_in_the_base_are_named_with_a_remedy_for_motors():
     _, q, tau = measured("driven")
     absolute = np.cumsum(q, axis=1)

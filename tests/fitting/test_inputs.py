@@ -22,10 +22,12 @@ from nfriction import (
 from nfriction.export import c, mjcf, onnx, torchscript
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
+from nfriction.fitting.result.identifiability import Interval
 from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
+    _significant,
     candidates,
     chosen_inputs,
     friction_drives,
@@ -162,6 +164,21 @@ def test_the_fall_by_heat_is_recovered() -> None:
     torch.testing.assert_close(fall, expected, rtol=0, atol=0.05)
     assert found.model.schedule.cooling_time == pytest.approx(COOLING, rel=0.5)
     assert found.residual < 0.1 * law.residual
+
+
+@pytest.mark.parametrize(
+    ("name", "intervals", "expected"),
+    [
+        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (1e-12, 0.05)}, False),
+        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (0.01, 0.05)}, True),
+        ("direction", {"d of joint1": (-1.6, 2.3)}, False),
+        ("direction", {"d of joint1": (-0.6, -0.3)}, True),
+        ("load", {"F_c of joint1": (0.2, 0.3)}, False),
+    ],
+)
+def test_an_input_must_differ_from_zero_at_a_joint(name, intervals, expected):
+    found = SimpleNamespace(intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()])
+    assert _significant(found, name) == expected
 
 
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])

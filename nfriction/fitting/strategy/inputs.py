@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.result.fit_result import FitResult, InputGain
-from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.result.of_search import NOTHING, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -332,12 +332,22 @@ def chosen_inputs(
         widened = widened_start(widening, start, [*held, gain.name])
         if widened is None:
             raise StoppedError
-        if not widened.residual < at.residual:
+        if not (widened.residual < at.residual and _significant(widened, gain.name)):
             return tuple(chosen), at, seeing
         # As found by the search; the linearisation predicts only the choice.
         share = 1.0 - (widened.residual / at.residual) ** 2
         chosen.append(replace(gain, share=share))
         at, seeing = widened, widening
+
+
+def _significant(found: FitResult, name: str) -> bool:
+    """True if the 95 % interval of an input's coefficient does not include zero at some joint.
+
+    The intervals take into account that residuals are correlated, unlike the evidence.
+    """
+    own = f"{INPUTS[name].name} of "
+    of_input = (i for i in found.intervals if i.name.startswith(own))
+    return any(not i.low <= NOTHING <= i.high for i in of_input)
 
 
 @dataclass(frozen=True)
