@@ -237,12 +237,13 @@ def unlike_training(
 
 def _causes(
     plant: Plant, data: _Data, tau_f: Tensor, left: Tensor, options: FitOptions
-) -> Iterator[tuple[float, str]]:
+) -> list[tuple[float, str]]:
     """Unexplained share [-] with other friction, torque or encoder zeros, and the change."""
     kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
     zero = ", or its encoder has another zero" * weighs(plant)
     own, tau = (data.moving * data.mean(x) for x in (tau_f, data.tau))
     names, drives, grown, rest = plant.joint_names, data.driven, [], left.clone()
+    found: list[tuple[float, str]] = []
 
     def fitted(j: int, shapes: Tensor) -> tuple[Tensor, float]:
         part, rest = shapes @ (torch.linalg.pinv(shapes) @ left[:, j]), left.clone()
@@ -257,20 +258,18 @@ def _causes(
         times = 1 + relative(part, own[:, j])
         # A wrong sign has causes of its own.
         if times > 0:
-            yield share, f"the friction of {name} is {times:.3g} times theirs"
+            found.append((share, f"the friction of {name} is {times:.3g} times theirs"))
             rest[:, j] -= part
             grown.append(f"that of {name} {times:.3g} times theirs")
         if j in drives:
             part, share = fitted(j, tau[:, [j]])
             true = 1 - relative(part, tau[:, j])
             if true > 0:
-                yield share, f"the {kind} of {name} is {1 / true:.3g} times theirs"
+                found.append((share, f"the {kind} of {name} is {1 / true:.3g} times theirs"))
             part, share = fitted(j, data.moving[:, [j]])
             size = relative(part, data.moving[:, j])
-            yield share, f"the {kind} of {name} has an offset of {size:.3g} {unit}{zero}"
-    if len(grown) == len(names) > 1:
-        share = _share(plant, data, rest.square().mean(0))
-        yield share, f"every friction differs, {', '.join(grown)}"
+            text = f"the {kind} of {name} has an offset of {size:.3g} {unit}{zero}"
+            found.append((share, text))
     # The torque of a drive shows an offset, too.
     zeros, _ = _torques_of_terms(plant, data, options) if not drives else ([], [])
     first = len(names) - len(zeros)
@@ -278,8 +277,13 @@ def _causes(
         part = data.moving * data.mean(slope)
         size = relative(left.flatten(), part.flatten())
         share = _share(plant, data, (left - size * part).square().mean(0))
-        off = math.degrees(size)
-        yield share, f"the encoder of {name} has another zero, {abs(off):.2g} degrees off"
+        off = abs(math.degrees(size))
+        found.append((share, f"the encoder of {name} has another zero, {off:.2g} degrees off"))
+    share = _share(plant, data, rest.square().mean(0))
+    # A change of several joints explains most, so it has to explain clearly more.
+    if len(grown) == len(names) > 1 and options.diagnosis_tie * share < min(found)[0]:
+        found.append((share, f"every friction differs, {', '.join(grown)}"))
+    return found
 
 
 def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mistake]:

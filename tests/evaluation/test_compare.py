@@ -213,6 +213,7 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
         ({"friction": 3.0}, r"that of joint1 3\.?\d* times theirs, that of joint2 (3|2\.9)"),
         # Hardly visible in the torque, but over seconds of motion.
         ({"friction": 1.1}, r"free: the best fit errs by .* times the limit of these data; in"),
+        ({"of joint1": 4.0}, r"ings: the friction of joint1 is (4|3\.9)[.\d]* times theirs"),
         ({"zero": 0.1}, r"the encoder of joint2 has another zero, 5\.[78]\d* degrees off"),
         ({}, ""),
     ],
@@ -223,6 +224,7 @@ def test_a_free_test_recording_that_differs_is_named(recwarn, change, text):
     for name, start in (("train", (2.0, 0.2)), ("free", (2.2, 0.5))):
         own = change if name == "free" else {}
         values = own.get("friction", 1) * np.array([[0.02, 0.005], [0.008, 0.003]])
+        values[0] *= own.get("of joint1", 1)
         truth = CVFM(2, values.tolist(), v_smooth=0.01).requires_grad_(False)
         made = swing(rig, truth, seconds=4.0, start=start)
         q = made.q + np.array([0.0, own.get("zero", 0.0)])
