@@ -140,9 +140,9 @@ def test_a_torque_that_turns_sharply_has_no_spike():
     tau = np.sin(2 * math.pi * 0.3 * time)
     tau += 0.8 * np.abs(np.mod(time, 2.0) - 1.0)
     recording = Recording(time, np.sin(time)[:, None], tau[:, None])
-    assert not any(inputs._torque_spikes([recording], FitOptions()))
+    assert not any(inputs._spikes([recording], FitOptions()))
     spiked = replace(recording, tau=tau[:, None] + 0.5 * (np.arange(SAMPLES) == 700)[:, None])
-    assert len([*inputs._torque_spikes([spiked], FitOptions())]) == 1
+    assert len([*inputs._spikes([spiked], FitOptions())]) == 1
 
 
 def test_a_gain_of_one_drive_beyond_the_usual_is_named():

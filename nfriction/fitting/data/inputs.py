@@ -432,7 +432,7 @@ def data_warnings(
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
     of_logs = (
-        *_unlike_clocks(given, options), *_spikes(given, options), *_torque_spikes(given, options),
+        *_unlike_clocks(given, options), *_spikes(given, options),
         *_held_torques(given), *_velocities(joint, motions), *finer_counts(plant, given),
     )  # fmt: skip
     return (*of_logs, *still, *heavy)
@@ -538,23 +538,31 @@ def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iter
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples far from both neighbours, on the same side."""
+    """Single samples of positions and torques far from both neighbours, on the same side."""
+    remedies = (
+        "such spikes are errors of the sensor, leave these samples out",
+        "if these are errors of the log, interpolate them: a simulation adds them up, whatever the "
+        "loss",
+    )
     for recording in recordings:
-        far, _ = _far_samples(recording.q, options)
-        for name, peak in zip(recording.names, far.T, strict=True):
-            if peak.any():
-                yield (
-                    f"{recording.name or 'A recording'}: {name} jumps for one sample at "
-                    f"{_times(recording.time[1:-1][peak])}; such spikes are errors of the sensor, "
-                    "leave these samples out."
-                )
+        kinds = ("", recording.q, 0.01), ("the torque of ", recording.tau, 0.05)
+        for (what, x, share), remedy in zip(kinds, remedies, strict=True):
+            if x is None:
+                continue
+            far, _ = _far_samples(x, options, share)
+            for name, peak in zip(recording.names, far.T, strict=True):
+                if peak.any():
+                    yield (
+                        f"{recording.name or 'A recording'}: {what}{name} jumps for one sample at "
+                        f"{_times(recording.time[1:-1][peak])}; {remedy}."
+                    )
 
 
 def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
     """Steps of a position far above both adjacent steps, which are similar."""
     for recording in recordings:
         time, heights = recording.time, []
-        _, least = _far_samples(recording.q, options)
+        _, least = _far_samples(recording.q, options, 0.01)
         # Across a gap any step is possible.
         steps = np.diff(recording.q, axis=0)
         steps[gaps(time)] = np.nan
@@ -577,9 +585,7 @@ def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Itera
             yield f"{where} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
 
 
-def _far_samples(
-    x: Array, options: FitOptions, most: float = 0.01
-) -> tuple[NDArray[np.bool_], Array]:
+def _far_samples(x: Array, options: FitOptions, most: float) -> tuple[NDArray[np.bool_], Array]:
     """True where an inner sample is far from both neighbours, and the least such distance.
 
     At most a share `most` of the curvatures may be of spikes.
@@ -595,21 +601,6 @@ def _far_samples(
     # A joint may show no count.
     least = options.spike_ratio * np.fmax(curved, count_seen(x))
     return height > least, least
-
-
-def _torque_spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples of torque far from both neighbours."""
-    for recording in recordings:
-        if recording.tau is None:
-            continue
-        far, _ = _far_samples(recording.tau, options, 0.05)
-        for name, peak in zip(recording.names, far.T, strict=True):
-            if peak.any():
-                yield (
-                    f"{recording.name or 'A recording'}: the torque of {name} jumps for one sample "
-                    f"at {_times(recording.time[1:-1][peak])}; if these are errors of the log, "
-                    "interpolate them: a simulation adds them up, whatever the loss."
-                )
 
 
 def _held_torques(recordings: Sequence[Recording]) -> Iterator[str]:
