@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction.plant import LinearAxis, Motor, Rotor
+from nfriction.plant import LinearAxis, Motor, PendulumChain, Rotor
 from nfriction.recording import Recording, RecordingWarning, read_initial_states
 from nfriction.recording.angles import AngleConvention
 
@@ -784,6 +784,13 @@ def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
     assert named.q[0, 0] == pytest.approx(np.deg2rad(5.0) / 50)
     with pytest.raises(ValueError, match="names q1 and motor1, but one follows"):
         Recording.from_pandas(table, columns={"q1": "q1", "motor1": "enc"}, plant=GEARED)
+
+
+def test_a_joint_without_a_current_beside_others_is_named_by_its_motor() -> None:
+    arm = PendulumChain([1.0, 0.5], [0.3, 0.2], motor=Motor(50, torque_constant=0.03))
+    table = motor_log(motor1=1.0, motor2=0.5, current1=0.1)
+    with pytest.warns(RecordingWarning, match=r"no column current2, .* columns={\"current2\": "):
+        Recording.from_pandas(table, plant=arm)
 
 
 def test_a_motor_unknown_to_the_rig_is_named() -> None:

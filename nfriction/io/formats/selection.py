@@ -323,8 +323,10 @@ def _remarks(
             yield finding, 'if it is a unit, convert the column, or state one, as in "enc_1:deg"'
     free = lacking["tau"]
     if 0 < len(free) < joints:
-        finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
-        yield finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'
+        of_motors = any(source.motor == "current" for source in sources.values())
+        named = [name.replace("tau", "current") if of_motors else name for name in free]
+        finding = f"no column {', '.join(named)}, so that joint is assumed to be passive"
+        yield finding, f'if it is driven, name it with columns={{"{named[0]}": "..."}}'
     read = {source.column for source in sources.values()}
     drives = {name: kind for name, kind in _drives(table).items() if name not in read}
     unread = [name for name in drives if f"tau{_number(name)}" not in sources] if free else []
