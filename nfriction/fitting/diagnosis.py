@@ -886,17 +886,20 @@ def changing_friction(
                 mean = float((clock - clock.min()).mean() / span)
                 rate, _, size = _growth(of, piece < 0, *given)
                 sd = math.sqrt((pieces - 1) * np.var(rates))
-                # Nothing changes its sign; an exponential may fit where a line does not.
-                if of == "offset" or (rate * (1 - mean) > -1 and rate * mean < 1):
+                # No friction changes its sign, and a torque constant changes by less than that of
+                # another drive may differ; an exponential may fit where a line does not.
+                signs = rate * (1 - mean) > -1 and rate * mean < 1
+                usual = abs(rate) <= options.gain_term[0]
+                if {"offset": True, "friction": signs, "scale": usual}[of]:
                     change = _Change(of, period, rate, sd, mean, size, growing, constant)
                     tried.append(change)
             if not tried:
                 continue
             best, *_ = tried = sorted(tried, key=lambda x: float(x.growing.sum()))
             # Friction is what usually changes.
-            usual = next((x for x in tried if x.of == "friction"), best)
-            if not improves(best.growing, usual.growing, options.drift_chance):
-                best = usual
+            friction_alone = next((x for x in tried if x.of == "friction"), best)
+            if not improves(best.growing, friction_alone.growing, options.drift_chance):
+                best = friction_alone
             # A change of 1 % hardly shows in a simulation.
             least = best.sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
             if abs(best.rate) > max(0.01, least) and improves(

@@ -564,14 +564,17 @@ def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Itera
         time, heights = recording.time, []
         _, least = _far_samples(recording.q, options, 0.01)
         # Across a gap any step is possible.
-        steps = np.diff(recording.q, axis=0)
+        steps, periods = np.diff(recording.q, axis=0), np.diff(time)[:, None]
         steps[gaps(time)] = np.nan
+        even = steps * recording.sample_time / periods
         # Also if scaled to equal length: either the samples or their time stamps may jitter.
-        for step in (steps, steps * (recording.sample_time / np.diff(time))[:, None]):
+        for step in (steps, even):
             before, at, after = step[:-2], step[1:-1], step[2:]
             high = np.minimum(np.abs(at - before), np.abs(at - after))
             heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
-        height = np.minimum(*heights)
+        # If a sample is late, the next step makes up for it, and both together are as usual.
+        both = (steps[:-2] + steps[1:-1]) * recording.sample_time / (periods[:-2] + periods[1:-1])
+        height = np.where(2 * np.abs(both - even[2:]) > least, np.minimum(*heights), 0.0)
         for name, jump, high in zip(recording.names, (height > least).T, height.T, strict=True):
             if not jump.any():
                 continue
