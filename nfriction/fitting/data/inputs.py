@@ -572,7 +572,7 @@ def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Itera
             before, at, after = step[:-2], step[1:-1], step[2:]
             high = np.minimum(np.abs(at - before), np.abs(at - after))
             heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
-        # If a sample is late, the next step makes up for it, and both together are as usual.
+        # The step after a late sample is long, and both together are as usual.
         both = (steps[:-2] + steps[1:-1]) * recording.sample_time / (periods[:-2] + periods[1:-1])
         height = np.where(2 * np.abs(both - even[2:]) > least, np.minimum(*heights), 0.0)
         for name, jump, high in zip(recording.names, (height > least).T, height.T, strict=True):
