@@ -560,7 +560,7 @@ def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> N
     """Require distinct names, and test recordings that no fit sees.
 
     Raises:
-        ValueError: repeated names, or a recording in both parts, whatever its names.
+        ValueError: repeated names, or a recording or a piece of it in both parts.
     """
     seen = [r.name or "a recording" for r in test if any(_contains(t, r) for t in train)]
     if seen:

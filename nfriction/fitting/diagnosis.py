@@ -260,7 +260,7 @@ def _causes(
         if times > 0:
             found.append((share, f"the friction of {name} is {times:.3g} times theirs"))
             rest[:, j] -= part
-            grown.append(f"that of {name} {times:.3g} times theirs")
+            grown.append(f"of {name} is {times:.3g} times")
         if j in drives:
             part, share = fitted(j, tau[:, [j]])
             true = 1 - relative(part, tau[:, j])
@@ -282,7 +282,7 @@ def _causes(
     share = _share(plant, data, rest.square().mean(0))
     # A change of several joints explains most, so it has to explain clearly more.
     if len(grown) == len(names) > 1 and options.diagnosis_tie * share < min(found)[0]:
-        found.append((share, f"every friction differs, {', '.join(grown)}"))
+        found.append((share, f"the friction {' and '.join(grown)} theirs"))
     return found
 
 
@@ -584,7 +584,7 @@ def _corrected_positions(
         angles: Angles = "relative" if convention.angles == "absolute" else "absolute"
         other = AngleConvention(angles, convention.measured_from)
         # Motors turn their joints, so a convention cannot make their angles absolute.
-        remedy = "`convention`" if plant.motor is None else "of a belt: convert the motor's columns"
+        remedy = "`convention`" if plant.motor is None else "a belt drive? convert its columns"
         text = f"angles are {angles}, not {convention.angles} ({remedy})"
         yield text, recorded(eye, reading=other)
     # Columns of motors are exchanged before their gears.
@@ -840,7 +840,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
 def changing_friction(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
 ) -> Iterator[tuple[str, str]]:
-    """Joints whose friction, or a drive's scale or offset, changes with time: which, a sentence.
+    """Changes with time of a joint's friction, its torque's scale or an offset: kind and sentence.
 
     Changes may happen during recordings or between them. For the arguments see `likely_mistakes`. A
     wrong law, rig or delay must not appear as a change: friction may be any function of speed plus
@@ -888,9 +888,12 @@ def changing_friction(
                 sd = math.sqrt((pieces - 1) * np.var(rates))
                 # No friction changes its sign, and a torque constant changes by less than that of
                 # another drive may differ; an exponential may fit where a line does not.
-                signs = rate * (1 - mean) > -1 and rate * mean < 1
-                usual = abs(rate) <= options.gain_term[0]
-                if {"offset": True, "friction": signs, "scale": usual}[of]:
+                plausible = {
+                    "friction": rate * (1 - mean) > -1 and rate * mean < 1,
+                    "scale": abs(rate) <= options.gain_term[0],
+                    "offset": True,
+                }
+                if plausible[of]:
                     change = _Change(of, period, rate, sd, mean, size, growing, constant)
                     tried.append(change)
             if not tried:

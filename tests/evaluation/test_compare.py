@@ -210,7 +210,10 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"friction": 3.0}, r"that of joint1 3\.?\d* times theirs, that of joint2 (3|2\.9)"),
+        (
+            {"friction": 3.0},
+            r"friction of joint1 is 3\.?\d* times and of joint2 is (3|2\.9)\d* times theirs",
+        ),
         # Hardly visible in the torque, but over seconds of motion.
         ({"friction": 1.1}, r"free: the best fit errs by .* times the limit of these data; in"),
         ({"of joint1": 4.0}, r"ings: the friction of joint1 is (4|3\.9)[.\d]* times theirs"),

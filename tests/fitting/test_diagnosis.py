@@ -123,7 +123,7 @@ def test_motors_in_the_base_are_named_with_a_remedy_for_motors():
     absolute = np.cumsum(q, axis=1)
     geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 40.0], torque_constant=0.1))
     (found, *_) = warnings_of(geared, absolute, tau)
-    assert "angles are absolute, not relative (of a belt: convert the motor's columns)" in found
+    assert "angles are absolute, not relative (a belt drive? convert its columns)" in found
 
 
 def test_a_torque_of_coarse_steps_is_neither_clipped_nor_stuck():

@@ -79,7 +79,7 @@ def require_doubles(model: torch.nn.Module, plant: torch.nn.Module) -> None:
 def turning_velocity(
     plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion]
 ) -> tuple[float, float]:
-    """Width of the smoothed sign of the velocity, and the smaller one to be wished [rad/s; m/s].
+    """Width of the smoothed sign of the velocity, and that without a limit of steps [rad/s; m/s].
 
     A joint that friction holds creeps at about this velocity. It is a small share of the slowest
     joint's largest velocity; where a rig is driven or comes to rest, it moves no joint by more than

@@ -32,7 +32,7 @@ CHUNK = 1024
 # Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
 # products, few enough for the processor's cache.
 PIECE = 2000
-# Derivatives of states that are carried through time together.
+# Numbers that are carried through time together, derivatives of the states of some windows: 1 MB.
 CARRIED = 2**17
 
 
