@@ -72,7 +72,7 @@ class _Writer:
     def write(self, groups: Mapping[str, Sequence[Node]]) -> None:
         """Compute outputs; arrays that are not shared are loaded before anything is stored."""
         outputs = [node for group in groups.values() for node in group]
-        order = reachable(outputs, [n for n in reachable(outputs) if n.number in self.places])
+        order = reachable(outputs, self.places)
         # An output may be an input array, so a store could destroy values not yet read.
         for node in order:
             if node.number in self.places and self.places[node.number][0] not in self.shared:

@@ -5,7 +5,7 @@ subexpressions never arise. Each node has an `UpdateRate`: that of its most vola
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -155,9 +155,8 @@ def is_predicate(node: Node) -> bool:
     return node.op in PREDICATES or isinstance(node.value, bool)
 
 
-def reachable(outputs: Iterable[Node], stop: Iterable[Node] = ()) -> list[Node]:
-    """Nodes that `outputs` need, arguments first; `stop` nodes are listed but not entered."""
-    border = {node.number for node in stop}
+def reachable(outputs: Iterable[Node], stop: Container[int] = ()) -> list[Node]:
+    """Nodes that `outputs` need, arguments first; those numbered in `stop` are not entered."""
     seen: dict[int, Node] = {}
     stack = list(outputs)
     while stack:
@@ -165,7 +164,7 @@ def reachable(outputs: Iterable[Node], stop: Iterable[Node] = ()) -> list[Node]:
         if node.number in seen:
             continue
         seen[node.number] = node
-        if node.number not in border:
+        if node.number not in stop:
             stack.extend(node.args)
     # Node numbers increase and arguments are created first, so sorting is topological.
     return [seen[number] for number in sorted(seen)]

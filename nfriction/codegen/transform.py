@@ -4,6 +4,7 @@ Derivatives use forward mode on the scalar graph. Values that depend only on par
 out of the steps.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, reduce
 
@@ -185,10 +186,7 @@ def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
     last place; sums are left alone, because regrouping them can cause cancellation.
     """
     nodes = reachable(outputs)
-    uses: dict[int, int] = {}
-    for node in nodes:
-        for argument in node.args:
-            uses[argument.number] = uses.get(argument.number, 0) + 1
+    uses = Counter(argument.number for node in nodes for argument in node.args)
     inner = {
         argument.number
         for node in nodes

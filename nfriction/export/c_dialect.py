@@ -6,6 +6,7 @@ The text depends only on the graph, so the same model gives the same bytes.
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -207,18 +208,12 @@ def statements(
 
     `bound` has the text of available nodes (inputs, hoisted values), by node number.
     """
-    nodes = reachable(outputs, [n for n in reachable(outputs) if n.number in bound])
-    uses: dict[int, int] = {}
-    for node in nodes:
-        if node.number not in bound:
-            for argument in node.args:
-                uses[argument.number] = uses.get(argument.number, 0) + 1
-    for node in outputs:
-        uses[node.number] = uses.get(node.number, 0) + 1
+    nodes = reachable(outputs, bound)
+    uses = Counter(a.number for node in nodes if node.number not in bound for a in node.args)
+    uses.update(node.number for node in outputs)
     lines: list[str] = []
     texts: dict[int, tuple[str, int]] = {}
-
-    def write(node: Node) -> None:
+    for node in nodes:
         if node.number in bound:
             texts[node.number] = bound[node.number], ATOM
         elif node.op == "constant":
@@ -233,9 +228,6 @@ def statements(
                 lines.append(f"const {kind} {name} = {text};")
                 text, binding = name, ATOM
             texts[node.number] = text, binding
-
-    for node in nodes:
-        write(node)
     return lines, [texts[node.number][0] for node in outputs]
 
 
