@@ -8,7 +8,7 @@ from itertools import zip_longest
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES, Comparison, Part
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import ModelInfo, describe
+from nfriction.io.model_file import unit_for
 
 Value = str | float
 Sets = Mapping[str, Mapping[str, Sequence[float]]]
@@ -190,5 +190,11 @@ def interval_table(
 
 def coefficient_units(model: FrictionModel, unit: str) -> dict[str, str]:
     """Unit of each coefficient for positions in `unit`."""
-    described = describe(model, ModelInfo(unit=unit))
-    return {c["name"]: c["unit"] for c in described["coefficients"]}
+    return {c.name: unit_for(c.unit, unit) for c in model.law.coefficients}
+
+
+def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
+    """The given names, or joint1, joint2, ...; ValueError if there is not one for each joint."""
+    if names is not None and len(names) != joints:
+        raise ValueError(f"`joint_names` must be {joints} names, got {list(names)}.")
+    return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]

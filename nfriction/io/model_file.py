@@ -111,7 +111,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
         raise ValueError(
             f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
         )
-    torque = _unit("N m", info.unit)
+    torque = unit_for("N m", info.unit)
     return {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -122,7 +122,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
         "v_smooth": model.v_smooth,
         "options": model.options(),
         "coefficients": [
-            {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
+            {"name": c.name, "unit": unit_for(c.unit, info.unit), "positive": c.positive}
             for c in model.law.coefficients
         ],
         "units": {"qd": f"{info.unit}/s", "qdd": f"{info.unit}/s^2",
@@ -132,7 +132,8 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _unit(revolute: str, position: str) -> str:
+def unit_for(revolute: str, position: str) -> str:
+    """A revolute joint's unit, adapted to positions in `"rad"` or `"m"`."""
     return revolute if position == "rad" else revolute.replace("N m", "N").replace("rad", "m")
 
 
@@ -250,8 +251,7 @@ def load_info(path: str | Path) -> ModelInfo:
     Raises:
         ModelFileError: the file is absent or damaged.
     """
-    content = read_model_file(path)
-    return _info(content)
+    return _info(read_model_file(path))
 
 
 def load_plant(path: str | Path) -> Plant:

@@ -21,6 +21,7 @@ from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name, plain_name
 from nfriction.friction.memory import load_at_rest
 from nfriction.friction.models import FrictionModel
+from nfriction.io.model_file import unit_for
 from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
@@ -79,7 +80,7 @@ def torque_over_velocity(
         binned = _binned(qd[seen, k], torque[seen, k])
         # Dots may scatter far beyond the friction, so laws and quartiles set the limits.
         extremes = np.concatenate([*lines.values(), *binned[1:]])
-        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
+        factor, unit = style.scaled(unit_for("N m", plant.unit), extremes)
         _dots(ax, qd[seen, k], factor * torque[seen, k])
         _medians(ax, binned, factor)
         for name, line in lines.items():

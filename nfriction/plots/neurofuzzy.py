@@ -12,11 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from nfriction.evaluation.tables import ZERO
+from nfriction.evaluation.tables import ZERO, joint_labels
 from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
 from nfriction.fuzzy.membership import FuzzyRules
+from nfriction.io.model_file import unit_for
 from nfriction.plots import style
 from nfriction.signals import Motion
 
@@ -55,7 +56,7 @@ def memberships(
                 f"{shapes[0]}, got {shapes[1]}."
             )
         drawn.insert(0, (start, _BEFORE))
-    names = style.joint_labels(joint_names, model.joints)
+    names = joint_labels(joint_names, model.joints)
     figure, axes = style.panels(model.joints, 2, style.PAGE, 0.45 + 1.1 * model.joints, sharey=True)
     for j, row in enumerate(axes):
         for i, ax in enumerate(row):
@@ -170,7 +171,7 @@ def coefficients_over_time(
     if len(laws := {model.law.name for model in models.values()}) != 1:
         raise ValueError(f"`models` must be one or several of one law, got {sorted(laws)}.")
     first = next(iter(models.values()))
-    names = style.joint_labels(joint_names, first.joints)
+    names = joint_labels(joint_names, first.joints)
     along, of_law = np.stack([_along(m, motion) for m in models.values()]), first.law.coefficients
     varies = (np.ptp(along, 1) > 1e-6 * np.abs(along).max(1)).any((0, 1))  # more than rounding
     rows, still = np.flatnonzero(varies), np.flatnonzero(~varies)
@@ -197,7 +198,7 @@ def coefficients_over_time(
 def _value(coefficient: Coefficient, position: str, values: Array) -> str:
     """A coefficient of every model with its unit; one number if they are equal."""
     values = np.where(np.abs(values) > ZERO, values, 0.0)
-    factor, unit = style.scaled(style.sliding(coefficient.unit, position), values)
+    factor, unit = style.scaled(unit_for(coefficient.unit, position), values)
     texts = [f"{x:.3g}" for x in factor * values]
     number = " / ".join(texts) if len(set(texts)) > 1 else texts[0]
     return f"{style.symbol(coefficient.name)} = {number} {unit}".removesuffix(" -")
@@ -235,7 +236,7 @@ def coefficient_surfaces(
         ValueError: if the model has no fuzzy rules.
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
-    names = style.joint_labels(joint_names, model.joints)
+    names = joint_labels(joint_names, model.joints)
     # The fewer of the two go side by side, because maps with their colour bars need space.
     across = model.joints <= len(coefficients)
     rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
@@ -247,7 +248,7 @@ def coefficient_surfaces(
     for j, maps in enumerate(axes.T if across else axes):
         edges = _edges(rules, j)
         middles = _middles(edges)
-        values, sd = _on_grid(model, uncertainty, j, *middles)
+        values, sd = on_grid(model, uncertainty, j, *middles)
         counts = None if motions is None else _visits(rules, motions, j)
         seen = None if counts is None else _near(counts)
         for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
@@ -257,7 +258,7 @@ def coefficient_surfaces(
                 among = np.abs(values[..., k][... if seen is None or not seen.any() else seen])
                 vague = VAGUE * (float(among.mean()) or 1.0)
                 opacity = _LEAST + (1.0 - _LEAST) / (1.0 + (sd[..., k] / vague) ** 4)
-            label = (coefficient.name, style.sliding(coefficient.unit, unit))
+            label = (coefficient.name, unit_for(coefficient.unit, unit))
             draw_map(ax, edges, values[..., k], label=label, seen=seen, opacity=opacity)
             if counts is not None:
                 _density_lines(ax, middles, counts)
@@ -287,7 +288,7 @@ def coefficient_sections(
         One panel per joint and fitted coefficient; titles state the accelerations.
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
-    names = style.joint_labels(joint_names, model.joints)
+    names = joint_labels(joint_names, model.joints)
     rows, columns = model.joints, len(coefficients)
     figure, axes = style.panels(
         rows, columns, style.COLUMN if columns == 1 else style.PAGE, 0.4 + 1.5 * rows,
@@ -300,7 +301,7 @@ def coefficient_sections(
     for j, panels in enumerate(axes):
         edges = _edges(rules, j)
         speed, accelerations = _middles(edges)[0], _levels(edges[1])
-        values, sd = _on_grid(model, uncertainty, j, speed, np.array(accelerations))
+        values, sd = on_grid(model, uncertainty, j, speed, np.array(accelerations))
         seen = np.ones((len(levels), CELLS), dtype=bool)
         if motions is not None:
             row = np.searchsorted(edges[1], accelerations) - 1
@@ -355,7 +356,7 @@ def _levels(edges: Array) -> list[float]:
     return [middle - step, middle, middle + step]
 
 
-def _on_grid(
+def on_grid(
     model: FrictionModel,
     uncertainty: CoefficientUncertainty | None,
     joint: int,

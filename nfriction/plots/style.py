@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from nfriction.evaluation.compare import NO_FRICTION
 from nfriction.friction import both_names
 from nfriction.friction.laws import Coefficient
+from nfriction.io.model_file import unit_for
 
 COLUMN, PAGE = 3.5, 7.0
 """Widths of a figure in a two-column paper [in]: one column, both."""
@@ -99,7 +100,7 @@ def title(ax: Axes, text: str) -> None:
 
 def coefficient_axis(ax: Axes, coefficient: Coefficient, position: str, values: Any) -> float:
     """Label the y axis with a coefficient; return the factor from SI to the displayed unit."""
-    factor, unit = scaled(sliding(coefficient.unit, position), values)
+    factor, unit = scaled(unit_for(coefficient.unit, position), values)
     ax.set_ylabel(f"{symbol(coefficient.name)} [{unit}]")
     ax.yaxis.set_major_locator(MaxNLocator(4))
     return factor
@@ -161,11 +162,6 @@ def scaled(unit: str, values: Any) -> tuple[float, str]:
     return (1e3, f"m{unit}") if largest >= 2e-4 else (1e6, f"µ{unit}")
 
 
-def sliding(unit: str, position: str) -> str:
-    """A revolute joint's unit, adapted to positions in `"rad"` or `"m"`."""
-    return unit if position == "rad" else unit.replace("N m", "N").replace("rad", position)
-
-
 def symbol(name: str) -> str:
     """A coefficient's name in mathematical type: `f_o` with a subscript, `B` in italics."""
     match = re.fullmatch(r"([A-Za-z])(?:_([A-Za-z0-9]+))?", name)
@@ -173,13 +169,6 @@ def symbol(name: str) -> str:
         return name
     index = f"_\\mathrm{{{match[2]}}}" if match[2] else ""
     return f"${match[1]}{index}$"
-
-
-def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
-    """The given names, or joint1, joint2, ...; ValueError if there is not one for each joint."""
-    if names is not None and len(names) != joints:
-        raise ValueError(f"`joint_names` must be {joints} names, got {list(names)}.")
-    return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]
 
 
 def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:

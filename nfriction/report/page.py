@@ -97,9 +97,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     fuzzy = model.schedule.fuzzy_rules()
     if fuzzy is None:
         return []
-    names = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
-    if len(names) != model.joints:
-        raise ValueError(f"`joint_names` must be {model.joints} names, got {names}.")
+    names = tables.joint_labels(joint_names or None, model.joints)
     described = []
     for j, joint in enumerate(names):
         (speeds, speed_widths), (accelerations, widths) = (
