@@ -21,7 +21,7 @@ from nfriction.papers.reproduction.stages import ADAPTIVE, EXPERIMENT, LAWS
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plots import coefficients_over_time, motion, positions, style, torque_over_velocity
-from nfriction.plots.neurofuzzy import draw_map
+from nfriction.plots.neurofuzzy import draw_map, on_grid
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
 from nfriction.simulation.rollout import rollout
@@ -117,13 +117,9 @@ def network_surfaces(workspace: Workspace) -> Figure:
     figure, axes = style.panels(model.joints, 2, style.PAGE, 0.5 + 1.6 * model.joints, sharey="row")
     low, high = schedule.input_lower.numpy(), schedule.input_upper.numpy()
     for joint, row in enumerate(axes):
-        # Speed and acceleration of this joint; those of other joints are not used.
         x = np.linspace(0.0, high[joint, 0], _CELLS)
         y = np.linspace(low[joint, 1], high[joint, 1], _CELLS)
-        qd, qdd = (torch.as_tensor(v)[..., None].expand(_CELLS, _CELLS, model.joints)
-                   for v in np.meshgrid(x, y))  # fmt: skip
-        with torch.no_grad():
-            values = schedule(qd, qdd)[..., joint, :].numpy()
+        values, _ = on_grid(model, None, joint, x, y)
         for k, (ax, coefficient) in enumerate(zip(row, model.law.coefficients, strict=True)):
             draw_map(ax, (x, y), values[..., k], label=(coefficient.name, coefficient.unit))
             style.title(ax, tables.JOINTS[joint])
