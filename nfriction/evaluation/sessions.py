@@ -9,7 +9,6 @@ Spiegelhalter 2009, J. R. Stat. Soc. A 172, p. 137).
 
 import copy
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -23,15 +22,13 @@ from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import Usability
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
-from nfriction.recording import Recording
+from nfriction.recording import RecordingLike
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
-Session: TypeAlias = (
-    Recording | str | os.PathLike[str] | Sequence[Recording | str | os.PathLike[str]]
-)
+Session: TypeAlias = RecordingLike | Sequence[RecordingLike]
 
 
 class SessionFit(NamedTuple):

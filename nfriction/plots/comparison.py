@@ -101,16 +101,16 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
         errors = {n: s.simulated[:, joint] - measured for n, s in scores.items()}
         seen = np.abs([e for n, e in errors.items() if n in whole])
         shown = min(np.max(seen, where=np.isfinite(seen), initial=0.0), 0.5 * span) or span
-        factor, unit = 1e3, f"m{recording.unit}"  # as in every table
         for model, error in errors.items():
             position.plot(recording.time, scores[model].simulated[:, joint], **looks[model].line)
             if model != NO_FRICTION or len(scores) == 1:
-                below.plot(recording.time, factor * error, **looks[model].line)
+                # In thousandths, as in every table.
+                below.plot(recording.time, 1e3 * error, **looks[model].line)
         low, high = float(measured.min()), float(measured.max())
         position.set_ylim(low - 0.25 * span, high + 0.25 * span)
-        below.set_ylim(style.padded(-factor * shown, factor * shown))
+        below.set_ylim(style.padded(-1e3 * shown, 1e3 * shown))
         position.set_ylabel(f"{name} [{recording.unit}]")
-        below.set_ylabel(f"error [{unit}]")
+        below.set_ylabel(f"error [m{recording.unit}]")
         for ax in (position, below):
             ax.yaxis.set_major_locator(MaxNLocator(4))
             ax.margins(x=0.01)

@@ -195,17 +195,14 @@ class RBFCoefficients(Schedule):
         self.output_lower.copy_(outputs[0])
         self.output_upper.copy_(outputs[1])
 
-    def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
-        """The output layer (weights and bias), which is all that a trajectory fit varies."""
-        return self.network.output_weight, self.network.output_bias
-
     def parameter_vector(self) -> Tensor:
-        weight, bias = self.trained()
+        # Only the output layer: a trajectory fit varies nothing else.
+        weight, bias = self.network.output_weight, self.network.output_bias
         return torch.cat([weight, bias[..., None]], -1).detach().reshape(-1)
 
     @torch.no_grad()
     def set_parameter_vector(self, vector: Tensor) -> None:
-        weight, bias = self.trained()
+        weight, bias = self.network.output_weight, self.network.output_bias
         layer = vector.reshape(*bias.shape, -1)
         weight.copy_(layer[..., :-1])
         bias.copy_(layer[..., -1])
