@@ -72,8 +72,6 @@ def c(
         ValueError: if `info` or an option is malformed.
         OSError: if a file cannot be written.
     """
-    if dtype not in REALS:
-        raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
     if not is_identifier(name):
         raise ValueError(f"`name` must be an identifier of C of up to 31 letters, got {name!r}.")
     controller = controller_of(
