@@ -76,8 +76,7 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     add("--jobs", type=inputs.jobs, default=1, metavar="N",
         help="number of parallel fits, each in its own process; -1 for one per core (needs joblib; "
         "the results are the same)")  # fmt: skip
-    add("--log-file", type=Path, metavar="FILE",
-        help="append a log of stages, times and results")  # fmt: skip
+    add("--log-file", type=Path, metavar="FILE", help="append a log of stages, times and results")
 
 
 def run_fit(arguments: argparse.Namespace) -> int:

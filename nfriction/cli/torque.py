@@ -75,9 +75,8 @@ def run_fit(arguments: argparse.Namespace) -> int:
         found = fit_torque(table, arguments.models, folds=arguments.folds, progress=progress.stage)
         progress.stage("write results and figure")
         written = write_torque_fits(
-            found, arguments.out, command=arguments.command_line,
-            figures=not arguments.no_figures,
-        )  # fmt: skip
+            found, arguments.out, command=arguments.command_line, figures=not arguments.no_figures
+        )
     for name, why in found.failed.items():
         warn(f"{plain_name(name)} was not fitted: {one_line(why)}")
     for remark in found.table.remarks[len(table.remarks) :]:

@@ -336,9 +336,7 @@ def _schedule(controller: Controller, dialect: ControllerC) -> str:
 
     if not controller.remembers:
         return _function("nf_schedule", trace(coefficients, motion), ("c",), dialect)
-    state = {
-        **motion, "load": _example(joints), "last": _example(joints, controller.memory_size)
-    }  # fmt: skip
+    state = {**motion, "load": _example(joints), "last": _example(joints, controller.memory_size)}
     start = trace(schedule.initial_state, motion)
     return "\n".join([
         _function("nf_schedule_start", start, ("next",), dialect),

@@ -291,9 +291,8 @@ def coefficient_sections(
     names = joint_labels(joint_names, model.joints)
     rows, columns = model.joints, len(coefficients)
     figure, axes = style.panels(
-        rows, columns, style.COLUMN if columns == 1 else style.PAGE, 0.4 + 1.5 * rows,
-        sharex="row",
-    )  # fmt: skip
+        rows, columns, style.COLUMN if columns == 1 else style.PAGE, 0.4 + 1.5 * rows, sharex="row"
+    )
     levels = ("negative", "none", "positive")
     if rules.along_motion:
         levels = ("braking", "steady", "speeding up")

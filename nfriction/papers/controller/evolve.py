@@ -241,6 +241,4 @@ def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:
 
 def _described(options: EvolutionOptions) -> dict[str, object]:
     """Options on which populations depend; with more generations, a run continues."""
-    return {
-        "prices": list(options.prices), "population": options.population, "seed": options.seed
-    }  # fmt: skip
+    return {"prices": list(options.prices), "population": options.population, "seed": options.seed}

@@ -211,10 +211,7 @@ class _Fit:
         if not self.local.finite:
             return "not_finite"
         self._start()
-        with tqdm(
-            total=options.max_steps, disable=not options.progress,
-            unit="step",
-        ) as bar:  # fmt: skip
+        with tqdm(total=options.max_steps, disable=not options.progress, unit="step") as bar:
             while True:
                 known = self.posterior()
                 if self._settled(known):

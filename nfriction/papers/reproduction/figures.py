@@ -98,9 +98,8 @@ def without_friction(workspace: Workspace) -> Figure:
     assert isinstance(bench.plant, PendulumChain)
     first = recording[recording.time < recording.time[0] + WITHOUT_FRICTION_SECONDS]
     simulated = simulations(
-        bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0),
-        len(first) - 1,
-    )  # fmt: skip
+        bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0), len(first) - 1
+    )
     moved = {n: convention.position_from_joint(q) for n, q in simulated.items()}
     figure = motion(first, {name: _score(first, q) for name, q in moved.items()})
     for ax in figure.axes:
