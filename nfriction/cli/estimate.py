@@ -196,15 +196,15 @@ def _print(
         print(f"\n{tables.choice(selection)}")
     print(f"\n{tables.verdict(comparison)}")
     best = comparison.fits.get(comparison.best() or "")
+    model = arguments.out / "models" / f"{comparison.best()}.json"
     if best is not None:
         print(tables.coefficient_table(best.model, plant.joint_names, plant.unit))
         if intervals := tables.interval_table(best):
             print(intervals)
-        print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
+        print(f"its model file: {model}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")
     if conclusion := _conclusion(comparison):
-        model = arguments.out / "models" / f"{comparison.best()}.json"
         print(f"\n{conclusion}")
         print(f"all figures on a page: {shlex.join(['nfriction', 'report', str(arguments.out)])}")
         if best is not None and _has_controller(best.model, model_info(best, train)):

@@ -428,8 +428,8 @@ def compare(
             raise
         progress.resume()
     # Fits without heat come first: their friction depends on the current motion alone.
-    best = min(fits.values(), key=lambda fit: (fit.model.state_size, fit.residual))
-    warned += _warned(_mistakes(plant, best, data, tested, faster=bool(warned)))
+    named = min(fits, key=lambda name: (fits[name].model.state_size, fits[name].residual))
+    warned += _warned(_mistakes(plant, fits[named], data, tested, faster=bool(warned)))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     zeroed = any(found.encoder_offsets for found in fits.values())
@@ -443,7 +443,6 @@ def compare(
                     scored(r, initial_state=states.get(r.name), **how) for r in recordings
                 ]
         progress.done()
-    named = next(name for name, fit in fits.items() if fit is best)
     of_best = [scores[part].get(named, []) for part in ("train", "test")]
     known = {text.partition(":")[0] for text in warned}
     warned += _warned(_worse_than_training(*of_best, known=known, unit=plant.unit))

@@ -137,14 +137,13 @@ def fit_sessions(
         )
     # In the order given, whichever ended first.
     fits = {label: fits[label] for label in sessions if label in fits}
-    names = list(next(iter(fits.values())).values)
     spreads = tuple(
         random_effects(
             name,
             np.array([f.values[name] for f in fits.values()]),
             np.array([f.sd[name] for f in fits.values()]),
         )
-        for name in names
+        for name in next(iter(fits.values())).values
     )
     # Coefficients that are not fitted stay as they are.
     mean, means = copy.deepcopy(model), {s.name: s.mean for s in spreads}

@@ -91,11 +91,9 @@ def animate(
     looks = style.looks(name for name in motions if name != MEASURED)
     lines = {}
     for name in motions:
-        look = (
-            {"color": style.FAINT, "linewidth": 6.0}
-            if name == MEASURED
-            else _line(looks[name].line["color"])
-        )
+        look: dict[str, object] = {"color": style.FAINT, "linewidth": 6.0}
+        if name != MEASURED:
+            look = _line(looks[name].line["color"])
         lines[name] = [ax.plot([], [], **look)[0] for ax in axes[0]]
     for ax, view in zip(axes[0], views, strict=True):
         _frame(ax, view, plant)

@@ -223,9 +223,7 @@ def _moved(variable: Variable, offset: float, factor: float) -> Variable:
         return replace(term, parameters=(factor * centre + offset, factor * sigma))
 
     low, high = (factor * end + offset for end in variable.universe)
-    return replace(
-        variable, universe=(low, high), sets=tuple(moved(term) for term in variable.sets)
-    )
+    return replace(variable, universe=(low, high), sets=tuple(map(moved, variable.sets)))
 
 
 def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:

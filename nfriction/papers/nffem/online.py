@@ -220,9 +220,8 @@ def _law(learner: OnlineNetwork, dialect: ControllerC) -> tuple[list[str], str]:
         lambda qd, load, c: law_slopes(learner.model, qd, load, c, learner.learnt),
         {"qd": example[:1], "load": example[1:2], "c": example[None, 2:]},
     )
-    names = {"qd": "qd", "load": "load"}
     bound = {
-        node.number: names.get(port.name, f"c[{i}]")
+        node.number: f"c[{i}]" if port.name == "c" else port.name
         for port in program.inputs
         for i, node in enumerate(port.nodes)
     }
