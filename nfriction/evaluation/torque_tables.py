@@ -8,10 +8,10 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 
@@ -36,7 +36,6 @@ from nfriction.recording.torque_table import (
 )
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 logger = logging.getLogger(__name__)
@@ -180,8 +179,6 @@ class TorqueFits:
 
     def to_frame(self) -> pd.DataFrame:
         """NRMSE on hold-out blocks by joint and model."""
-        import pandas as pd  # slow to import
-
         spread = {joint.name: float(joint.tau.std()) for joint in self.table.joints}
         rows = {
             joint: {c.name: c.error / spread[joint] for c in of}
@@ -194,8 +191,6 @@ class TorqueFits:
 
         Slip elements and terms that were not selected are left out.
         """
-        import pandas as pd  # slow to import
-
         rows = []
         pairs = zip(self.table.joint_names, self._names(name), strict=True)
         for k, (joint, own) in enumerate(pairs):
@@ -245,9 +240,9 @@ class TorqueFits:
 
     def plot(self) -> Figure:
         """Friction torque over velocity with its 95 % band; see `plots.friction_curves`."""
-        # By name, because plots is a layer above this one.
-        figure: Figure = resolve_name("nfriction.plots:friction_curves")(self)
-        return figure
+        from nfriction import plots  # matplotlib is slow to import
+
+        return plots.friction_curves(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: choices, errors on hold-out blocks, coefficients and intervals."""
@@ -653,8 +648,6 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     Raises:
         ValueError: if the table's joints are others, or it lacks a load that a model needs.
     """
-    import pandas as pd  # slow to import
-
     _check_joints([one.joint for one in models], table)
     pairs = zip(models, table.joints, strict=True)
     return pd.DataFrame([score_joint(joint, one.model) for one, joint in pairs]).set_index("joint")

@@ -17,7 +17,7 @@ from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.hysteresis import path_of
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
-from nfriction.fitting.torque_table import predict
+from nfriction.fitting.torque_table import JointFit, predict
 from nfriction.friction import model_by_name, plain_name
 from nfriction.friction.memory import load_at_rest
 from nfriction.friction.models import FrictionModel
@@ -25,12 +25,11 @@ from nfriction.io.model_file import unit_for
 from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
+from nfriction.recording.torque_table import JointTorque
 from nfriction.signals import Motion, kalman_smoother
 
 if TYPE_CHECKING:
     from nfriction.evaluation.torque_tables import TorqueFits
-    from nfriction.fitting.torque_table import JointFit
-    from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]
 
@@ -171,12 +170,10 @@ def friction_curves(fits: "TorqueFits") -> Figure:
     shown: list[str] = []
     for k, (joint, ax) in enumerate(zip(joints, axes, strict=True)):
         chosen = fits.chosen[joint.name]
-        unlike = [
-            c for c in fits.candidates[joint.name] if _remembers(c.name) != _remembers(chosen)
-        ]
+        looped = _remembers(chosen)
+        unlike = [c for c in fits.candidates[joint.name] if _remembers(c.name) != looped]
         others = [c.name for c in sorted(unlike, key=lambda c: c.error)[:1]]
         shown += [chosen, *others]
-        looped = _remembers(chosen)
         draw = _loops if looped else _curves
         unit = draw(ax, fits, k, [(name, looks[name].line) for name in (chosen, *others)])
         _name_axes(ax, f"{joint.name}: {plain_name(chosen)}", fits.table.unit, unit)
@@ -235,7 +232,7 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
     return unit
 
 
-def _steady(found: "JointFit", joint: "JointTorque", qd: Array) -> tuple[Array, Array]:
+def _steady(found: JointFit, joint: JointTorque, qd: Array) -> tuple[Array, Array]:
     """Torque over velocity at the median load, and its standard deviation."""
     load = 1.0 if joint.load is None else float(np.median(joint.load))
     velocity = torch.as_tensor(qd)
