@@ -222,11 +222,7 @@ def _pattern(
         if state.evaluations == 0:
             value = _values(cost, box, box.start.new_tensor(state.point)[None])[0]
             state = replace(state, value=float(value), evaluations=1)
-        finest = (
-            options.tolerance
-            if residuals is None
-            else max(options.tolerance, math.sqrt(negligible))
-        )
+        finest = max(options.tolerance, math.sqrt(negligible))
         while state.mesh >= finest:
             moved = residuals is not None and (state.iterations == 0 or any(state.step))
             most = poll + trials + moved * (len(start) + 1)

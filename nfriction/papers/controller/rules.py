@@ -175,11 +175,10 @@ def _rule_base(document: Any) -> RuleBase:
     if ("table" in document) == ("rules" in document):
         raise ValueError('give either a "table" or a list of "rules".')
     inputs, outputs = (_variables(document[kind], kind) for kind in ("inputs", "outputs"))
-    rules = (
-        _listed_rules(document["rules"])
-        if "rules" in document
-        else _table_rules(document["table"], inputs, outputs)
-    )
+    if "rules" in document:
+        rules = _listed_rules(document["rules"])
+    else:
+        rules = _table_rules(document["table"], inputs, outputs)
     name = _expect(document.get("name", ""), str, "name", "text")
     return RuleBase(name, inputs, outputs, rules)
 
