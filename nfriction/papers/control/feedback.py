@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -145,6 +145,7 @@ def still(_: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
+@dataclass(eq=False)
 class Feedback:
     """Linear-quadratic feedback to an equilibrium, from a distance along a planned motion.
 
@@ -162,19 +163,15 @@ class Feedback:
         share: g, compensated fraction.
     """
 
-    def __init__(
-        self,
-        plant: PendulumChain,
-        top: Gains,
-        way: Sequence[Gains] = (),
-        *,
-        reference: Callable[[float], tuple[float, float]] = still,
-        compensation: Compensation | None = None,
-        share: float = 1.0,
-    ) -> None:
-        self.plant, self.top, self.way = plant, top, way
-        self.reference, self.compensation = reference, compensation
-        self.share = share
+    plant: PendulumChain
+    top: Gains
+    way: Sequence[Gains] = ()
+    _: KW_ONLY
+    reference: Callable[[float], tuple[float, float]] = still
+    compensation: Compensation | None = None
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
         self.sample = 0
         self.before: Gains | None = None
         self.state: Array = np.zeros(0)
