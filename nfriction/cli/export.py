@@ -176,8 +176,7 @@ def _write_simulator(
         raise UsageError("the model file has no rig; give --rig, because friction needs its loads.")
     model.check_loads(plant)
     recordings = inputs.read_recordings(arguments.recording, plant, arguments)
-    moved = (recording.joint_coordinates(plant) for recording in recordings)
-    motions = [kalman_smoother(recording.time, recording.q) for recording in moved]
+    motions = [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in recordings]
     path = arguments.out / f"{arguments.model.stem}{SIMULATORS[target]}"
     writer = getattr(export, target)
     print(writer(model, path, motions, info, load=plant.load, patch=arguments.patch))

@@ -28,7 +28,6 @@ class UnsupportedOperation(CodegenError):  # noqa: N818
             "`nfriction.codegen.supported_operations()`; otherwise fits are slow, and "
             'simulations need `rollout(..., backend="torch")`.'
         )
-        self.operation = operation
 
 
 class SelfCheckFailed(CodegenError):  # noqa: N818

@@ -101,8 +101,7 @@ class Bench:
 
 def smoothed(plant: Plant, recordings: Sequence[Recording]) -> list[Motion]:
     """Smoothed motions in joint coordinates."""
-    joint = [r.joint_coordinates(plant) for r in recordings]
-    return [kalman_smoother(r.time, r.q) for r in joint]
+    return [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in recordings]
 
 
 @dataclass(frozen=True)
