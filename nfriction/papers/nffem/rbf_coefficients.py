@@ -85,13 +85,10 @@ class RBFCoefficients(Schedule):
         # As wide as the motion in the papers.
         size = torch.tensor([20.0, 200.0, 1e4, 1e6], dtype=values.dtype)[:inputs].repeat(joints, 1)
         zero_speed = torch.tensor([0.0, -1.0, -1.0, -1.0], dtype=values.dtype)[:inputs]
-        for name, start in (
-            ("input_lower", zero_speed * size),
-            ("input_upper", size),
-            ("output_lower", values.clone()),
-            ("output_upper", values.clone()),
-        ):
-            self.register_buffer(name, start)
+        self.register_buffer("input_lower", zero_speed * size)
+        self.register_buffer("input_upper", size)
+        self.register_buffer("output_lower", values.clone())
+        self.register_buffer("output_upper", values.clone())
         # Only the bias is set: an untrained network is the constant law.
         nn.init.zeros_(self.network.output_weight)
         with torch.no_grad():

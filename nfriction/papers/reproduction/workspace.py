@@ -168,12 +168,7 @@ class Workspace:
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
             plain = {field: _tuples(value) for field, value in kept.items()}
-            # Fields that JSON stores as rows.
-            for field, kind in (
-                ("intervals", Interval),
-                ("outliers", Outliers),
-                ("inputs", InputGain),
-            ):
+            for field, kind in _ROWS.items():
                 plain[field] = tuple(kind(*row) for row in plain[field])
             return FitResult(
                 model=load(path), plant=load_plant(path), motions=tuple(bench.train_motions),
@@ -231,7 +226,9 @@ class Workspace:
         return self.folder / "stages" / f"{stage}.{suffix}"
 
 
-# Fields of a fit that are stored separately, with the twin, or not at all; others are plain JSON.
+# Fields of a fit that JSON stores as rows, and the class of a row.
+_ROWS = {"intervals": Interval, "outliers": Outliers, "inputs": InputGain}
+# Fields that are stored separately, with the twin, or not at all; others are plain JSON.
 _APART = ("model", "plant", "motions", "uncertainty", "residuals")
 
 
