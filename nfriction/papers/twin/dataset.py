@@ -45,12 +45,6 @@ class Release:
     degrees: Vector  # joint angles in the rig's own convention [deg]
     qd: Vector = (0.0, 0.0, 0.0)  # joint velocities [rad/s]
 
-    @property
-    def q(self) -> Vector:
-        """Joint angles in the rig's own convention [rad]."""
-        first, second, third = map(math.radians, self.degrees)
-        return first, second, third
-
 
 @dataclass(frozen=True)
 class Specification:
@@ -144,8 +138,8 @@ class Encoder:
     def drawn(cls, random: np.random.Generator) -> Encoder:
         """An encoder of typical quality: eccentricity 0.3 counts, edge errors 0.05 counts RMS."""
         phase = float(random.uniform(0.0, math.tau))
-        first, second, third, fourth = (0.05 * random.standard_normal(4)).tolist()
-        return cls(eccentricity=0.3, phase=phase, edges=(first, second, third, fourth))
+        edges = tuple((0.05 * random.standard_normal(4)).tolist())
+        return cls(eccentricity=0.3, phase=phase, edges=edges)
 
     def read(self, q: Array) -> Array:
         """Positions [rad] read by the counter at true positions of any shape."""
@@ -210,7 +204,7 @@ def make(
             truth[release.label] = simulate(
                 links,
                 specified.friction,
-                tuple(convention.position_to_joint(np.array(release.q)).tolist()),
+                tuple(convention.position_to_joint(np.radians(release.degrees)).tolist()),
                 tuple(convention.rate_to_joint(np.array(release.qd)).tolist()),
                 samples=samples,
                 rate=RATE,
@@ -254,7 +248,7 @@ def record(
         plant=plant,
         recordings=recordings,
         splits={release.label: release.split for release in releases},
-        initial_states={r.label: (np.array(r.q), np.array(r.qd)) for r in releases},
+        initial_states={r.label: (np.radians(r.degrees), np.array(r.qd)) for r in releases},
         truth=truth,
     )
 
