@@ -515,7 +515,10 @@ def _still_joints(
     count = seen if known is None else np.full(plant.joints, known)
     for name, extent, one in zip(plant.joint_names, ranges(joint), count, strict=True):
         if extent == 0:
-            yield f"{name} never moves: its friction is not observable."
+            yield (
+                f"{name} never moves: its friction is not observable. If a brake holds it, use a "
+                "rig in which its link is fixed, as simulations let it move."
+            )
         elif extent < min_counts * one:
             yield (
                 f"{name} moves by {extent:.3g} {plant.unit}, {extent / one:.0f} of its encoder's "

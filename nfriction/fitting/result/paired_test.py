@@ -39,6 +39,16 @@ def mean_gain(new: Tensor, old: Tensor) -> tuple[float, float]:
     return float(gains.mean()), spread
 
 
+def total_gain(new: Tensor, old: Tensor) -> tuple[float, float]:
+    """Half the logarithm of the ratio of sums over windows (window,), old to new, and its error.
+
+    The error is the jackknife's, because residuals are correlated within windows, not across them.
+    """
+    gain = 0.5 * float(torch.log(old.sum() / new.sum()))
+    without = 0.5 * torch.log((old.sum() - old) / (new.sum() - new))
+    return gain, jackknife_sd(without.tolist()) if len(new) > 1 else math.inf
+
+
 def jackknife_sd(without: Sequence[float]) -> float:
     """Standard error of an estimate, from those with each piece of the data left out in turn."""
     return math.sqrt((len(without) - 1) * float(np.var(without)))

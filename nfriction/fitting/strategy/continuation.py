@@ -18,7 +18,7 @@ from nfriction.fitting.result.identifiability import (
     information,
     standard_deviations,
 )
-from nfriction.fitting.result.paired_test import mean_gain, student_quantile
+from nfriction.fitting.result.paired_test import student_quantile, total_gain
 from nfriction.fitting.shooting.autocorrelation import (
     bandwidth,
     effective_noise,
@@ -344,8 +344,8 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     free swings without limit, but errors of a measured torque accumulate over a long window and
     bias its parameters. Even with a correct law and plant, torque noise accumulates, so longer
     windows may determine friction less well (`knows_less`). As the noise of each horizon is
-    unknown, errors are compared window by window; a stage loses if its parameters are worse at a
-    shorter horizon by more than the scatter, and over all horizons by more than that of the sum.
+    unknown, the logarithms of the errors are compared; a stage loses if its parameters are worse at
+    a shorter horizon by more than the scatter, and over all horizons by more than that of the sum.
     """
     from scipy.special import chdtri  # slow to import
 
@@ -361,8 +361,10 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
             lost = float(new.sum() - at.residuals.square().sum()) / at.noise**2
             if not lost <= float(chdtri(fitted, chance)):
                 return True
+        elif not new.isfinite().all():
+            return True
         elif found.problem.windows.tau.any():
-            gain, spread = mean_gain(new, _squares(at, before))
+            gain, spread = total_gain(new, _squares(at, before))
             total += gain
             # A single window has no scatter.
             variance += spread**2 if math.isfinite(spread) else 0.0
