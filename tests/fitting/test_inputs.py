@@ -27,6 +27,7 @@ from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
+    _recurring,
     _significant,
     candidates,
     chosen_inputs,
@@ -169,15 +170,18 @@ def test_the_fall_by_heat_is_recovered() -> None:
 @pytest.mark.parametrize(
     ("name", "intervals", "expected"),
     [
-        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (1e-12, 0.05)}, False),
-        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (0.01, 0.05)}, True),
-        ("direction", {"d of joint1": (-1.6, 2.3)}, False),
-        ("direction", {"d of joint1": (-0.6, -0.3)}, True),
-        ("load", {"F_c of joint1": (0.2, 0.3)}, False),
+        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (1e-12, 0.05)}, []),
+        ("position", {"F_p of joint1": (1e-12, 0.08), "F_p of joint2": (0.01, 0.05)}, [1]),
+        ("direction", {"d of joint1": (-1.6, 2.3)}, []),
+        ("direction", {"d of joint1": (-0.6, -0.3)}, [0]),
+        ("load", {"F_c of joint1": (0.2, 0.3)}, []),
     ],
 )
 def test_an_input_must_differ_from_zero_at_a_joint(name, intervals, expected):
-    found = SimpleNamespace(intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()])
+    found = SimpleNamespace(
+        intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()],
+        plant=SimpleNamespace(joint_names=["joint1", "joint2"]),
+    )
     assert _significant(found, name) == expected
 
 
@@ -449,4 +453,12 @@ def test_waves_of_an_axis_fit_into_its_stroke() -> None:
     task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, [recording], FitOptions(**BRIEF))
     possible = 2 * math.pi * np.arange(1, 5) / np.ptp(q)
     nearest = min(possible, key=lambda one: abs(one - rate))
-    assert float(with_position_load(task, law).plant.load_waves) == pytest.approx(nearest, rel=1e-3)
+    seeing = with_position_load(task, law)
+    assert float(seeing.plant.load_waves) == pytest.approx(nearest, rel=1e-3)
+    # Each half shows the wave, too, though it covers less of the stroke.
+    halves = [recording[:1000], recording[1000:]]
+    task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, halves, FitOptions(**BRIEF))
+    seeing = with_position_load(task, law)
+    assert _recurring(task, law, seeing) == [0]
+    other = seeing.plant.replace(load_waves=2.0 * seeing.plant.load_waves)
+    assert _recurring(task, law, replace(seeing, plant=other)) == []

@@ -27,13 +27,7 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.holdout import StoppedError
-from nfriction.fitting.task import (
-    FitTask,
-    constant_prior,
-    known_terms,
-    regression,
-    terms_after,
-)
+from nfriction.fitting.task import FitTask, constant_prior, known_terms, regression, terms_after
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated, HeatedConstant
 from nfriction.friction.inputs import INPUTS, has_input, reads_load, with_inputs
@@ -73,7 +67,7 @@ def candidates(task: FitTask) -> tuple[str, ...]:
     known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
     # The papers' network may have a hidden state of its own.
     heated = "network" not in task.model.options()
-    placed = free and bool(_covered(task).any(0).all())
+    placed = free and bool(_covered(task, _wave_rates(task)).any(0).all())
     possible = {"direction": True, "load": free and known, "position": placed, "heat": heated}
     return tuple(name for name in INPUTS if possible[name])
 
@@ -99,21 +93,22 @@ def _wave_rates(task: FitTask) -> Tensor:
     return 2 * math.pi / turn * torch.tensor(WAVES, dtype=torch.float64)
 
 
-def _covered(task: FitTask) -> Tensor:
+def _covered(task: FitTask, rates: Tensor) -> Tensor:
     """True where the motion covers half a period of a wave, (wave, joint).
 
     Otherwise its largest and smallest friction would be extrapolated.
     """
     visited = torch.as_tensor(np.ptp(np.concatenate([m.q for m in task.motions]), axis=0))
-    return torch.outer(_wave_rates(task), visited) >= math.pi
+    return torch.outer(rates, visited) >= math.pi
 
 
-def with_position_load(task: FitTask, start: FitResult) -> FitTask:
+def with_position_load(task: FitTask, start: FitResult, rates: Tensor | None = None) -> FitTask:
     """The task with the plant's load (1 + cos(k q + p)) / 2, for k and p favoured by the evidence.
 
     All waves and joints are fitted at once; then each joint keeps the wave that it needs most.
     """
-    rates, covered = _wave_rates(task), _covered(task)
+    rates = _wave_rates(task) if rates is None else rates
+    covered = _covered(task, rates)
 
     def load(q: Tensor, qd: Tensor) -> Tensor:
         angle = rates * q[..., None]
@@ -332,7 +327,10 @@ def chosen_inputs(
         widened = widened_start(widening, start, [*held, gain.name])
         if widened is None:
             raise StoppedError
-        if not (widened.residual < at.residual and _significant(widened, gain.name)):
+        where = _significant(widened, gain.name)
+        if gain.name == "position":
+            where = [j for j in where if j in _recurring(task, start, seeing=widening)]
+        if not (widened.residual < at.residual and where):
             return tuple(chosen), at, seeing
         # As found by the search; the linearisation predicts only the choice.
         share = 1.0 - (widened.residual / at.residual) ** 2
@@ -340,14 +338,29 @@ def chosen_inputs(
         at, seeing = widened, widening
 
 
-def _significant(found: FitResult, name: str) -> bool:
-    """True if the 95 % interval of an input's coefficient does not include zero at some joint.
+def _significant(found: FitResult, name: str) -> list[int]:
+    """Joints at which the 95 % interval of an input's coefficient does not include zero.
 
     The intervals take into account that residuals are correlated, unlike the evidence.
     """
-    own = f"{INPUTS[name].name} of "
-    of_input = (i for i in found.intervals if i.name.startswith(own))
-    return any(not i.low <= NOTHING <= i.high for i in of_input)
+    own = {f"{INPUTS[name].name} of {joint}": j for j, joint in enumerate(found.plant.joint_names)}
+    of_input = (i for i in found.intervals if i.name in own)
+    return [own[i.name] for i in of_input if not i.low <= NOTHING <= i.high]
+
+
+def _recurring(task: FitTask, start: FitResult, seeing: FitTask) -> list[int]:
+    """Joints whose wave over the position is that of `seeing` without any one recording, too.
+
+    Else it follows from what happened in one recording: a wave of some length fits any error.
+    """
+    waves, several = seeing.plant.load_waves, len(task.recordings) > 1
+    same = torch.ones_like(waves, dtype=torch.bool)
+    for one in task.recordings if several else ():
+        rest = [(r, m) for r, m in zip(task.recordings, task.motions, strict=True) if r is not one]
+        recordings, motions = zip(*rest, strict=True)
+        part = replace(task, recordings=recordings, motions=motions)
+        same &= with_position_load(part, start, _wave_rates(task)).plant.load_waves == waves
+    return same.nonzero().flatten().tolist()
 
 
 @dataclass(frozen=True)
