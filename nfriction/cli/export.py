@@ -95,7 +95,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     model, info = load(arguments.model), load_info(arguments.model)
     info = replace(info, sample_time=arguments.sample_time or info.sample_time)
     if info.rating and not info.rating.startswith("good"):
-        warnings.warn(f"{arguments.model.name} is rated {info.rating}.", stacklevel=1)
+        warnings.warn(f"{arguments.model.name} has the rating {info.rating!r}.", stacklevel=1)
     check_writable(arguments.out)
     for target in arguments.format:
         if target in SIMULATORS:

@@ -282,8 +282,9 @@ class Comparison:
                 found[str(name)] = f"{best} m{self.unit}, this model {own}"
             elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
                 found[str(name)] = "no friction predicts better"
+        least_unfit = min(found, key=rmse.__getitem__, default="")
         for name in rmse.index[rmse >= rmse[[*found]].min()].drop(excused, errors="ignore"):
-            found.setdefault(str(name), "it predicts no better than a model that is not to be used")
+            found.setdefault(str(name), f"it predicts no better than {least_unfit}, not to be used")
         return found
 
     def rating(self, name: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -636,9 +636,12 @@ def _corrected_rigs(plant: Plant, driven: bool) -> Iterator[tuple[str, Plant]]:
     if inertia.ndim == 1 and len(inertia):
         central = inertia - np.array(data["mass"]) * np.array(data["com"]) ** 2
         changes["inertias are about the joints, not about the mass centres"] = {"inertia": central}
+    tried: list[dict[str, Any]] = []
     for text, change in changes.items():
-        if change and change.keys() <= given.keys():
-            parts = {key: values.tolist() for key, values in change.items()}
+        parts = {key: values.tolist() for key, values in change.items()}
+        # A rig without inertias has them in no wrong unit.
+        if change and change.keys() <= given.keys() and parts not in tried:
+            tried.append({**parts})
             if motor:
                 parts["motor"] = motor | {k: parts.pop(k) for k in motor if k in parts}
             # Some would be no mechanism, or a strange one.

@@ -116,6 +116,8 @@ def fit(
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     found = strategy(task)
     unmodelled = *task.drift, *task.unmodelled
-    found = found.with_warnings(task.warnings_beside(found), task.mistakes, unmodelled)
+    found = found.with_own_model().with_warnings(
+        task.warnings_beside(found), task.mistakes, unmodelled
+    )
     # A law with heat explains friction that changes with time.
     return found.without(task.drift) if has_input(found.model.law, "heat") else found

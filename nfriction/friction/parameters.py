@@ -33,6 +33,9 @@ def as_tensor(name: str, values: Any, like: Tensor | None = None) -> Tensor:
         return values
     dtype, device = (torch.float64, None) if like is None else (like.dtype, like.device)
     try:
+        if isinstance(values, np.ndarray):
+            # torch takes neither reversed nor big-endian arrays, and drops imaginary parts.
+            values = values.astype(np.float64, casting="same_kind")
         return torch.as_tensor(values, dtype=dtype, device=device)
     # Ragged lists, strings, and integers too large for a float.
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:

@@ -404,7 +404,7 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     # A smaller model gets no better verdict for the same error.
     errors = {"no_friction": 5.0, "NCFM": 2.1, "CVFM": 1.0, "LFM": 2.1}
     reasons = scored(equal, **errors).unfit()
-    assert reasons["NCFM"] == "it predicts no better than a model that is not to be used"
+    assert reasons["NCFM"] == "it predicts no better than LFM, not to be used"
     assert set(scored(equal, **errors | {"NCFM": 2.0}).unfit()) == {"LFM"}
     # The data do not separate these.
     assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}

@@ -1314,3 +1314,9 @@ def test_an_unbalanced_rotor_is_named():
     plant, q, tau = measured("wheel")
     first = warnings_of(plant, q, tau + 0.4 * np.sin(q - 0.5))[0]
     assert "likely: joint1 has an unbalanced mass that the rig lacks (`mass` and `com`)." in first
+
+
+def test_a_wrong_unit_is_listed_once():
+    assert [text for text, _ in diagnosis._corrected_rigs(LinearAxis(2.0), True)] == [
+        "masses are in g"
+    ]

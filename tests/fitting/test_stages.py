@@ -130,6 +130,15 @@ def test_a_stage_bears_the_length_that_its_windows_have():
     assert [length for length, _ in found.stages] == [1.2]
 
 
+def test_another_fit_of_a_model_changes_no_earlier_result():
+    model, axis, fast = CVFM(1), LinearAxis(0.13), {"windows": (0.5,), "fit_plant": False}
+    first = fit(model, axis, driven_axis(axis, CVFM(1, [0.35, 0.12]), seconds=1.2), **fast)
+    before = first.model.schedule.values.clone()
+    fit(model, axis, driven_axis(axis, CVFM(1, [0.2, 0.3]), seconds=1.2), **fast)
+    assert torch.equal(first.model.schedule.values, before)
+    assert not torch.equal(model.schedule.values, before)
+
+
 @pytest.mark.slow
 def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
     """Noise of the torque adds up over long windows, and leads their parameters astray."""

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 import torch
 
@@ -258,6 +259,8 @@ def test_arrays_and_lists_are_inputs_too() -> None:
         expected = model(*tensors)
         assert torch.equal(model(*motion), expected), name
         assert torch.equal(model(*(x.numpy() for x in tensors)), expected), name
+        turned = [x.numpy().astype(">f8")[:, ::-1] for x in tensors]
+        assert torch.equal(model(*turned), model(*(x.flip(1) for x in tensors))), name
 
 
 @pytest.mark.parametrize("value", [10**400, "fast", None, [1e-3, 1e-3]])
@@ -282,7 +285,7 @@ def test_the_slope_at_rest_is_known_without_gradients_too(name: str) -> None:
 
 
 def test_what_is_no_number_is_refused_by_name() -> None:
-    for wrong in ("fast", None, [[1.0], [1.0, 2.0]], [10**400, 1.0]):
+    for wrong in ("fast", None, [[1.0], [1.0, 2.0]], [10**400, 1.0], np.array([1j, 1.0])):
         with pytest.raises(ValueError, match=r"^load must be an array of numbers, got"):
             LFM(2)([1.0, 2.0], [0.0, 0.0], wrong)
     with pytest.raises(

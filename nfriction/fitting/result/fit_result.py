@@ -1,5 +1,6 @@
 """Result of a fit: model, plant, convergence, confidence intervals and warnings."""
 
+import copy
 import html
 import math
 import re
@@ -147,6 +148,11 @@ class FitResult:
             mistakes=tuple(dict.fromkeys((*mistakes, *self.mistakes))),
             unmodelled=tuple(dict.fromkeys((*unmodelled, *self.unmodelled))),
         )  # fmt: skip
+
+    def with_own_model(self) -> "FitResult":
+        """The same with a copy of the model, as another fit may change the given one."""
+        model, uncertainty = copy.deepcopy((self.model, self.uncertainty))
+        return replace(self, model=model, uncertainty=uncertainty)
 
     def without(self, warnings: Sequence[str]) -> "FitResult":
         """The same without these warnings."""

@@ -19,18 +19,10 @@ from nfriction.fitting.result.identifiability import (
     standard_deviations,
 )
 from nfriction.fitting.result.paired_test import student_quantile, total_gain
-from nfriction.fitting.shooting.autocorrelation import (
-    bandwidth,
-    effective_noise,
-    hac_sd,
-)
+from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.uncertainty import (
-    explained,
-    gathered_information,
-    torque_noise,
-)
+from nfriction.fitting.shooting.uncertainty import explained, gathered_information, torque_noise
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel

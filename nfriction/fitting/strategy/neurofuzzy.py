@@ -40,13 +40,7 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
-from nfriction.fitting.task import (
-    FitTask,
-    constant_prior,
-    known_terms,
-    regression,
-    terms_after,
-)
+from nfriction.fitting.task import FitTask, constant_prior, known_terms, regression, terms_after
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated
 from nfriction.friction.inputs import has_input
