@@ -256,7 +256,7 @@ class TorqueFits:
                 for joint, of in self.candidates.items()
             },
             "residual": {
-                name: {j: one.residual for j, one in zip(self.chosen, found, strict=True)}
+                name: {j: _finite(one.residual) for j, one in zip(self.chosen, found, strict=True)}
                 for name, found in self.fits.items()
             },
             "failed": dict(self.failed),

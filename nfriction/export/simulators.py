@@ -227,7 +227,7 @@ _SNIPPETS = {
 
 def joint_names(model: FrictionModel, info: ModelInfo) -> tuple[str, ...]:
     """The joints' names, or numbers from 1 if they have none."""
-    return tuple(info.joint_names) or tuple(f"joint_{j + 1}" for j in range(model.joints))
+    return tuple(info.joint_names) or tuple(f"joint{j + 1}" for j in range(model.joints))
 
 
 def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:

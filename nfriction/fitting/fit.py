@@ -57,9 +57,9 @@ def fit(
     constant fit; `fit_adaptive` has more settings.
 
     Args:
-        model: the model to fit, changed in place; or its name, such as "coulomb-viscous", with
-            v_smooth at most 1/1000 of the slowest joint's largest velocity and 3 mrad/s or mm/s;
-            less for a rig that is driven or comes to rest.
+        model: the model to fit, changed in place (the result has a copy); or its name, such as
+            "coulomb-viscous", with v_smooth at most 1/1000 of the slowest joint's largest velocity
+            and 3 mrad/s or mm/s; less for a rig that is driven or comes to rest.
         plant: the mechanism as given, its name, or the path of a rig file.
         recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
             convention, by default the plant's.

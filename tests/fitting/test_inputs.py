@@ -275,7 +275,7 @@ def test_a_chosen_input_wins_or_leaves_the_model_as_it_was(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     found = fit(model, pendulum(), recording, start=law, max_steps=3, **BRIEF)
-    assert found.model is model
+    assert torch.equal(*(m.schedule.parameter_vector() for m in (found.model, model)))
     if name == "nothing":
         assert model.inputs is None
         assert not found.inputs
