@@ -135,7 +135,7 @@ def score(
             torque, and held at first, it is scored from its release.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
             used unchanged and scored from the first sample; by default estimated from a lead-in.
-        horizons: lengths of windows [s]; those longer than the recording are skipped.
+        horizons: lengths of windows [s]; left out if longer than the recording or under a sample.
         scheme: of the integration, see `rollout`; `"time_stepping"` if joints come to rest away
             from their equilibrium, to which a smoothed sign lets them creep back.
         limit: also find the limit of these data, which takes forty times as many simulations.

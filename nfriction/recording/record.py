@@ -283,6 +283,9 @@ class Recording:
                 torque; and as `Recording`.
         """
         _check_columns(columns)
+        if not hasattr(table, "attrs"):
+            kind = type(table).__name__
+            raise TypeError(f"`table` must be a pandas.DataFrame, got {kind}; convert it first.")
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
         factors = None if plant is None else plant.motor_factors

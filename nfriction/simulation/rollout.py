@@ -61,7 +61,7 @@ def rollout(
         plant: the mechanism, e.g. `rigs.tlrip()`.
         friction: friction model, or None for no friction.
         q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint). Like all
-            tensors here they may be arrays, which keep their precision, or lists, read as float64.
+            tensors here they may be arrays or lists; the run has the widest type among all.
         tau: joint torque [N m] held over each step, (steps, joint) or (*batch, steps, joint).
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
         steps: number of samples after the first; optional if `tau` or `sample_time` implies it.

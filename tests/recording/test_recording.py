@@ -70,6 +70,8 @@ def test_optional_columns_and_unit_survive(tmp_path: Path, ending: str) -> None:
 def test_pandas_round_trip() -> None:
     recording = swing(convention=AngleConvention("absolute"))
     assert Recording.from_pandas(recording.to_pandas()).digest() == recording.digest()
+    with pytest.raises(TypeError, match=r"`table` must be a pandas\.DataFrame, got dict"):
+        Recording.from_pandas({"time": [0.0, 1.0], "q1": [0.0, 1.0]})
 
 
 def test_arguments_override_the_file(tmp_path: Path) -> None:
