@@ -42,7 +42,14 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--prices", type=float, nargs="+", default=[0.0, 0.1, 0.3, 1.0],
                         help="of all rules, as shares of the first error")  # fmt: skip
     given = parser.parse_args(argv)
-    workspace, bench = common.start(given)
+    options = EvolutionOptions(
+        prices=tuple(given.prices), population=given.population, generations=given.generations,
+        seed=given.seed, checkpoint=given.out / "checkpoints" / "evolution.json",
+    )  # fmt: skip
+    bench = common.read(given)
+    if given.joint > bench.plant.joints:
+        raise ValueError(f"--joint must be 1 to {bench.plant.joints}, got {given.joint}.")
+    workspace = common.start(given, bench)
     adaptive = fit_by_class(workspace, bench, given.model).model
     train_motions = bench.train_motions
     controllers = controllers_from_classes(
@@ -51,14 +58,8 @@ def train(argv: Sequence[str] | None) -> str:
         np.concatenate([m.qd for m in train_motions]),
         np.concatenate([m.qdd for m in train_motions]),
     )
-    if not 1 <= given.joint <= len(controllers):
-        raise ValueError(f"--joint must be 1 to {len(controllers)}, got {given.joint}.")
     start, joint = controllers[given.joint - 1], given.joint - 1
     samples = _samples(bench, bench.train, train_motions, joint)
-    options = EvolutionOptions(
-        prices=tuple(given.prices), population=given.population, generations=given.generations,
-        seed=given.seed, checkpoint=given.out / "checkpoints" / "evolution.json",
-    )  # fmt: skip
     front = evolve(start, adaptive.law, samples, v_smooth=adaptive.v_smooth, options=options)
     first = Candidate(
         start, torque_error(start, adaptive.law, samples, adaptive.v_smooth),
@@ -77,6 +78,7 @@ def train(argv: Sequence[str] | None) -> str:
         ]
     table.to_csv(given.out / "pareto.csv", index_label="controller")
     _draw(table).savefig(given.out / "pareto.png", dpi=150)
+    common.finished(given)
     return f"{table.round(3).to_string()}\nwrote {given.out / 'pareto.csv'} and its figure"
 
 

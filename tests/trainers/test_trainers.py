@@ -76,18 +76,62 @@ def test_every_offered_model_exists(script: str) -> None:
     assert set(offered) <= set(model_names())
 
 
-def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
-    def start(*words: str) -> None:
-        given = common.parser("").parse_args([*words, "--out", str(tmp_path)])
-        common.checkpoints(given)
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A recording, in the folder of the file of its rig."""
+    rigs.write(PendulumChain([0.5], [0.4], [0.2], [0.01]), tmp_path / "rig.json")
+    time = np.arange(400) / 200
+    table = pd.DataFrame({"time": time, "q1": 3 + np.exp(-time) * np.cos(6 * time)})
+    table.to_csv(tmp_path / "run.csv", index=False)
+    return tmp_path / "run.csv"
 
-    start("--seed", "3")
-    start("--seed", "3", "--resume")
+
+def begin(log: Path, *words: object) -> None:
+    """What a trainer does before its fits."""
+    words = (log, "--rig", log.with_name("rig.json"), "--out", log.parent, *words)
+    given = common.parser("").parse_args([*map(str, words)])
+    common.start(given, common.read(given))
+
+
+def test_checkpoints_of_other_options_are_refused(log: Path) -> None:
+    begin(log, "--seed", "3")
+    begin(log, "--seed", "3", "--resume")
     with pytest.raises(ValueError, match="other options"):
-        start("--seed", "4", "--resume")
-    (tmp_path / "checkpoints" / "stages" / "NLFM.json").write_text("of an earlier run")
-    start("--seed", "4")  # anew
-    assert not (tmp_path / "checkpoints" / "stages" / "NLFM.json").exists()
+        begin(log, "--seed", "4", "--resume")
+
+
+@pytest.mark.parametrize(("name", "old", "new"), [("run.csv", ",4.0", ",4.001"),
+                                                  ("rig.json", "0.4", "0.5")])  # fmt: skip
+def test_checkpoints_of_a_file_that_has_changed_are_refused(
+    log: Path, name: str, old: str, new: str
+) -> None:
+    begin(log)
+    path = log.with_name(name)
+    before = path.read_text()
+    path.write_text(before.replace(old, new))
+    with pytest.raises(ValueError, match=rf"other contents of \S*{name}; restore"):
+        begin(log, "--resume")
+    path.write_text(before)
+    begin(log, "--resume")
+
+
+def test_checkpoints_are_deleted_only_after_a_finished_run_and_for_good_data(log: Path) -> None:
+    begin(log)
+    begin(log)  # no result is lost yet
+    kept = log.with_name("checkpoints") / "stages" / "NLFM.json"
+    kept.write_text("a result")
+    with pytest.raises(ValueError, match=r"did not finish.*--resume, or delete"):
+        begin(log)
+    common.finished(common.parser("").parse_args(["--out", str(log.parent)]))
+    for wrong in (["--rig", "no.json"], ["--angles", "x"], ["--rig", "tlrip"]):
+        with pytest.raises((ValueError, OSError)):
+            begin(log, *wrong)
+    with pytest.raises(SystemExit, match="--joint must be 1 to 1, got 2"):
+        train("evolve_rules.py", log, "--rig", log.with_name("rig.json"), "--joint", "2",
+              "--out", log.parent)  # fmt: skip
+    assert kept.exists()
+    begin(log)
+    assert not kept.exists()
 
 
 def test_recordings_need_a_rig(tmp_path: Path) -> None:
