@@ -8,13 +8,14 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal
 
 import numpy as np
 import torch
 from matplotlib.ticker import MaxNLocator
 
-from nfriction.cli.inputs import positive
+from nfriction.cli import console
+from nfriction.cli.inputs import count, positive
 from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import score
 from nfriction.export import torchscript
@@ -64,7 +65,7 @@ def parser(description: str) -> argparse.ArgumentParser:
         default=30,
         help="limit on steps of the fit at each window length",
     )
-    made.add_argument("--seed", type=int, default=0)
+    made.add_argument("--seed", type=count, default=0)
     made.add_argument("--out", type=Path, default=Path("runs/train"), help="folder to write")
     made.add_argument("--resume", action="store_true",
                       help="continue from the checkpoints in the folder; without it, those of "
@@ -111,7 +112,7 @@ def start(given: argparse.Namespace, bench: Bench, **settings: object) -> Worksp
     workspace.finish("options", made.to_dict())
     signal.signal(
         signal.SIGINT,
-        lambda *_: _end(given.out),
+        lambda *_: _end(f"interrupted; progress is saved in {given.out}, resume with --resume"),
     )
     return workspace
 
@@ -225,19 +226,26 @@ def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _end(folder: Path) -> NoReturn:
+def _end(message: str) -> None:
     # On KeyboardInterrupt solvers keep their best point, which would look like a finished stage.
-    sys.stderr.write(f"\ninterrupted; progress is saved in {folder}, resume with --resume\n")
+    sys.stderr.write(f"\n{message}\n")
     sys.exit(INTERRUPTED)
 
 
 def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> None:
-    """Run a trainer on one thread and print its report; errors are reported in one line."""
+    """Run a trainer on one thread and print its report.
+
+    Errors and Ctrl-C are reported in one line. A reader that closes the output is no error.
+    """
     # Multithreading makes operations on small tensors up to 100 times slower.
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, lambda *_: _end("interrupted"))
     try:
-        print(train(argv))
-    except KeyboardInterrupt:  # before there is a folder
-        sys.exit(INTERRUPTED)
+        try:
+            print(train(argv))
+        finally:
+            sys.stdout.flush()  # otherwise a closed pipe fails too late to be caught
+    except BrokenPipeError:
+        sys.exit(console.drop_output())
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

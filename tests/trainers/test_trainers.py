@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import re
 import runpy
 import signal
@@ -19,6 +20,8 @@ import torch
 from nfriction import ANCFM, CVFM, load, rollout, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
+from nfriction.papers.nffem import train_network
+from nfriction.papers.nffem.evidence import EvidenceState
 from nfriction.plant import PendulumChain, rigs
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
@@ -170,6 +173,51 @@ def test_networks_are_trained_on_the_supervised_set(
     assert adaptive is not None or (spread > 0).all()
     for name in (f"{made}.pt", f"{made}-loss.png", f"{made}-outputs.png"):
         assert (tmp_path / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+def test_an_interrupted_training_of_networks_writes_no_model(
+    tmp_path: Path,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    joint: int,
+) -> None:
+    monkeypatch.setattr("nfriction.datasets.cache_folder", lambda: cache)
+    begun = []
+
+    def interrupt(state: EvidenceState) -> None:
+        begun.extend([state] if state.step == 1 else [])
+        if len(begun) == joint:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(train_network, "recorded_losses", lambda names: ({}, interrupt))
+    with pytest.raises(SystemExit) as ended:
+        train("train_supervised.py", "--seconds", "3", "--units", "3", "--max-steps", "2",
+              "--out", tmp_path)  # fmt: skip
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "\ninterrupted\n"
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_closed_output_is_no_error() -> None:
+    script = f"import sys; sys.path.insert(0, {str(TRAINERS)!r}); import common; common.run(str)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.communicate()[1] == b""
+    assert process.returncode == 141
+
+
+@pytest.mark.parametrize("script", [*SCRIPTS, "evolve_rules.py", "learn_online.py"])
+def test_a_negative_seed_is_refused_by_name(
+    script: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        train(script, "--seed", "-1")
+    assert "argument --seed: must be a whole number from 0, got '-1'" in capsys.readouterr().err
 
 
 def test_networks_tolerate_noise_on_what_they_learn(
