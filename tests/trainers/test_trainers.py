@@ -20,6 +20,7 @@ import torch
 from nfriction import ANCFM, CVFM, load, rollout, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
+from nfriction.papers.controller import load_rules, paper_controller
 from nfriction.papers.nffem import train_network
 from nfriction.papers.nffem.evidence import EvidenceState
 from nfriction.plant import PendulumChain, rigs
@@ -301,6 +302,12 @@ def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
     assert (tmp_path / "arm.c").exists()
 
 
+def test_written_rules_are_read_back(tmp_path: Path) -> None:
+    rules, path = paper_controller(3).rule_base, tmp_path / "rules.json"
+    runpy.run_path(str(TRAINERS / "evolve_rules.py"))["write_rules"](rules, path)
+    assert load_rules(path) == rules
+
+
 @pytest.mark.slow
 def test_rules_evolve_to_a_front_and_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -314,6 +321,8 @@ def test_rules_evolve_to_a_front_and_go_on(
     assert table["rules"].iloc[1:].is_monotonic_increasing
     assert table["training error [mN m]"].iloc[1:].is_monotonic_decreasing
     assert (tmp_path / "pareto.png").stat().st_size > 0
+    files = [tmp_path / f"candidate-{number}.json" for number in range(1, len(table))]
+    assert [len(load_rules(file).rules) for file in files] == table["rules"].iloc[1:].to_list()
     train(*words, "--resume")
     assert capsys.readouterr().out == first
 
