@@ -1,19 +1,21 @@
 """Shared code of the scripts in `trainers/`: options, recordings, and the end of a run."""
 
 import argparse
+import hashlib
 import json
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal
 
 import numpy as np
 import torch
 from matplotlib.ticker import MaxNLocator
 
-from nfriction.cli.inputs import positive
+from nfriction.cli import console
+from nfriction.cli.inputs import count, positive
 from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import score
 from nfriction.export import torchscript
@@ -29,6 +31,8 @@ from nfriction.recording.angles import AngleConvention
 
 # Options that do not change the result.
 _IRRELEVANT = ("out", "resume")
+# In the folder of the checkpoints: what they depend on, and the mark of a finished run.
+OPTIONS, FINISHED = Path("stages", "options.json"), Path("finished")
 # Exit status that shells expect of a program ended by Ctrl-C.
 INTERRUPTED = 130
 
@@ -61,49 +65,90 @@ def parser(description: str) -> argparse.ArgumentParser:
         default=30,
         help="limit on steps of the fit at each window length",
     )
-    made.add_argument("--seed", type=int, default=0)
+    made.add_argument("--seed", type=count, default=0)
     made.add_argument("--out", type=Path, default=Path("runs/train"), help="folder to write")
     made.add_argument("--resume", action="store_true",
-                      help="resume from the checkpoints in the folder")  # fmt: skip
+                      help="continue from the checkpoints in the folder; without it, those of "
+                           "a finished run are deleted, and others refused")  # fmt: skip
     return made
 
 
-def start(given: argparse.Namespace, **settings: object) -> tuple[Workspace, Bench]:
-    """The checkpoints of a run and its recordings.
+def start(given: argparse.Namespace, bench: Bench, **settings: object) -> Workspace:
+    """Checkpoints from which `--resume` continues, or none; from here on, Ctrl-C names them.
 
     Args:
-        given: parsed options of a `parser()`.
+        given: parsed options of a `parser()`, all checked: checkpoints of a finished run go now.
+        bench: from `read`.
         settings: `Settings` in addition to those common to all trainers.
 
     Raises:
-        ValueError: if the checkpoints to resume from were made with other options.
+        ValueError: if the checkpoints to resume from were made with other options or data, or those
+            of an unfinished run would be lost.
     """
-    workspace = checkpoints(given, **settings)
-    signal.signal(signal.SIGINT, lambda *_: _end(given.out))
-    return workspace, _bench(given)
-
-
-def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
-    """Checkpoints from which `--resume` continues, or none."""
+    folder = given.out / "checkpoints"
     options = {k: v for k, v in vars(given).items() if k not in _IRRELEVANT}
+    origin = {"options": options, "digests": _digests(given, bench)}
     made = Settings(
         seed=given.seed, windows=tuple(given.windows), max_steps=given.max_steps,
         fit_plant=given.plant == "fit",
-        origin=json.dumps(options, default=str, sort_keys=True), **settings,  # type: ignore[arg-type]
+        origin=json.dumps(origin, default=str, sort_keys=True), **settings,  # type: ignore[arg-type]
     )  # fmt: skip
-    folder = given.out / "checkpoints"
     workspace = Workspace(folder, made, progress=sys.stderr.isatty())
     if not given.resume:
+        if _unfinished(folder):
+            raise ValueError(
+                f"{folder} has the progress of a run that did not finish; continue it with "
+                "--resume, or delete this folder to discard it."
+            )
         shutil.rmtree(folder, ignore_errors=True)
     elif workspace.begun("options") and workspace.result("options") is None:
+        changed = ", ".join(_changed(folder, origin["digests"]))
         raise ValueError(
-            f"{folder}: made with other options; use the same, or start again without --resume."
-        )
+            f"{folder}: made "
+            + (f"with other contents of {changed}; restore them" if changed else
+               "with other options or by another version; use the same")
+            + ", or delete this folder and start again without --resume."
+        )  # fmt: skip
     workspace.finish("options", made.to_dict())
+    signal.signal(
+        signal.SIGINT,
+        lambda *_: _end(f"interrupted; progress is saved in {given.out}, resume with --resume"),
+    )
     return workspace
 
 
-def _bench(given: argparse.Namespace) -> Bench:
+def _digests(given: argparse.Namespace, bench: Bench) -> dict[str, str]:
+    """Digest of the content of each given file, as contents may change under the same name."""
+    if not given.recordings:
+        return {}
+    rig = json.dumps(bench.plant.to_dict(), sort_keys=True)
+    found = {str(given.rig): hashlib.sha256(rig.encode()).hexdigest()}
+    pairs = zip(given.recordings, bench.train, strict=True)
+    return found | {str(path): recording.digest() for path, recording in pairs}
+
+
+def _changed(folder: Path, digests: Mapping[str, str]) -> list[str]:
+    """Files that had another digest when the checkpoints in this folder were begun."""
+    try:
+        kept = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
+        before = json.loads(kept["result"]["origin"])["digests"]
+    except (ValueError, KeyError, TypeError):  # damaged, or of an earlier version
+        return []
+    return [name for name, digest in digests.items() if before.get(name, digest) != digest]
+
+
+def _unfinished(folder: Path) -> bool:
+    """True for checkpoints with results of a run that did not write its last file."""
+    results = {path for path in folder.rglob("*") if path.is_file()} - {folder / OPTIONS}
+    return bool(results) and folder / FINISHED not in results
+
+
+def finished(given: argparse.Namespace) -> None:
+    """Mark the checkpoints as those of a finished run, which a new one may delete."""
+    (given.out / "checkpoints" / FINISHED).touch()
+
+
+def read(given: argparse.Namespace) -> Bench:
     """The given recordings, all used for training, or those of the twin."""
     if not given.recordings:
         made = twin.make(
@@ -121,6 +166,12 @@ def _bench(given: argparse.Namespace) -> Bench:
         Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
         for path in given.recordings
     ]
+    for path, recording in zip(given.recordings, train, strict=True):
+        if recording.joints != plant.joints:
+            raise ValueError(
+                f"--rig must have the joints of the recordings, got {plant.joints} and "
+                f"{recording.joints} in {path}; give the file of its rig."
+            )
     return Bench(plant, train, [], smoothed(plant, train), {})
 
 
@@ -147,6 +198,7 @@ def write(
             f"{recording.name}, {split}: position RMSE of the free run by joint {joints} "
             f"m{plant.unit}"
         )
+    finished(given)
     return "\n".join([*lines, f"wrote {path}, {path.with_suffix('.pt')} and {name}-loss.png"])
 
 
@@ -174,19 +226,26 @@ def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def _end(folder: Path) -> NoReturn:
+def _end(message: str) -> None:
     # On KeyboardInterrupt solvers keep their best point, which would look like a finished stage.
-    sys.stderr.write(f"\ninterrupted; progress is saved in {folder}, resume with --resume\n")
+    sys.stderr.write(f"\n{message}\n")
     sys.exit(INTERRUPTED)
 
 
 def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> None:
-    """Run a trainer on one thread and print its report; errors are reported in one line."""
+    """Run a trainer on one thread and print its report.
+
+    Errors and Ctrl-C are reported in one line. A reader that closes the output is no error.
+    """
     # Multithreading makes operations on small tensors up to 100 times slower.
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, lambda *_: _end("interrupted"))
     try:
-        print(train(argv))
-    except KeyboardInterrupt:  # before there is a folder
-        sys.exit(INTERRUPTED)
+        try:
+            print(train(argv))
+        finally:
+            sys.stdout.flush()  # otherwise a closed pipe fails too late to be caught
+    except BrokenPipeError:
+        sys.exit(console.drop_output())
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

@@ -4,10 +4,13 @@
 
 Coefficients by class define the output ranges of a controller with the papers' rules; evolution
 varies its ranges and the terms of its rules, and omits rules. Writes the Pareto front as table and
-figure, with errors on a twin's test recordings. `--resume` continues after the last generation.
+figure, with errors on a twin's test recordings, and the rules of each candidate as a file for
+`nfriction.papers.controller.load_rules`. `--resume` continues after the last generation.
 """
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import common
 import numpy as np
@@ -21,6 +24,7 @@ from nfriction.papers.controller.evolve import (
     evolve,
     torque_error,
 )
+from nfriction.papers.controller.rules import FORMAT, RuleBase, Variable
 from nfriction.papers.reproduction.procedure import controllers_from_classes
 from nfriction.papers.reproduction.stages import fit_by_class
 from nfriction.papers.reproduction.workspace import Bench
@@ -42,7 +46,14 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--prices", type=float, nargs="+", default=[0.0, 0.1, 0.3, 1.0],
                         help="of all rules, as shares of the first error")  # fmt: skip
     given = parser.parse_args(argv)
-    workspace, bench = common.start(given)
+    options = EvolutionOptions(
+        prices=tuple(given.prices), population=given.population, generations=given.generations,
+        seed=given.seed, checkpoint=given.out / "checkpoints" / "evolution.json",
+    )  # fmt: skip
+    bench = common.read(given)
+    if given.joint > bench.plant.joints:
+        raise ValueError(f"--joint must be 1 to {bench.plant.joints}, got {given.joint}.")
+    workspace = common.start(given, bench)
     adaptive = fit_by_class(workspace, bench, given.model).model
     train_motions = bench.train_motions
     controllers = controllers_from_classes(
@@ -51,14 +62,8 @@ def train(argv: Sequence[str] | None) -> str:
         np.concatenate([m.qd for m in train_motions]),
         np.concatenate([m.qdd for m in train_motions]),
     )
-    if not 1 <= given.joint <= len(controllers):
-        raise ValueError(f"--joint must be 1 to {len(controllers)}, got {given.joint}.")
     start, joint = controllers[given.joint - 1], given.joint - 1
     samples = _samples(bench, bench.train, train_motions, joint)
-    options = EvolutionOptions(
-        prices=tuple(given.prices), population=given.population, generations=given.generations,
-        seed=given.seed, checkpoint=given.out / "checkpoints" / "evolution.json",
-    )  # fmt: skip
     front = evolve(start, adaptive.law, samples, v_smooth=adaptive.v_smooth, options=options)
     first = Candidate(
         start, torque_error(start, adaptive.law, samples, adaptive.v_smooth),
@@ -77,7 +82,37 @@ def train(argv: Sequence[str] | None) -> str:
         ]
     table.to_csv(given.out / "pareto.csv", index_label="controller")
     _draw(table).savefig(given.out / "pareto.png", dpi=150)
-    return f"{table.round(3).to_string()}\nwrote {given.out / 'pareto.csv'} and its figure"
+    for old in given.out.glob("candidate-*.json"):  # of an earlier run, which may have had more
+        old.unlink()
+    for number, one in enumerate(front, 1):
+        write_rules(one.controller.rule_base, given.out / f"candidate-{number}.json")
+    common.finished(given)
+    return (
+        f"{table.round(3).to_string()}\n"
+        f"wrote {given.out / 'pareto.csv'}, its figure and candidate-1.json to "
+        f"candidate-{len(front)}.json"
+    )
+
+
+def write_rules(rules: RuleBase, path: Path) -> None:
+    """Write rules in the form of `load_rules`."""
+
+    def described(variables: Sequence[Variable]) -> dict[str, object]:
+        return {
+            v.name: {
+                "unit": v.unit,
+                "universe": v.universe,
+                "sets": {s.name: {"shape": s.shape, "parameters": s.parameters} for s in v.sets},
+            }
+            for v in variables
+        }
+
+    content = {
+        "format": FORMAT, "name": rules.name,
+        "inputs": described(rules.inputs), "outputs": described(rules.outputs),
+        "rules": [{"if": r.given, "then": r.then, "weight": r.weight} for r in rules.rules],
+    }  # fmt: skip
+    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _samples(

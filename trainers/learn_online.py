@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from nfriction import fit, rollout, save
-from nfriction.cli.inputs import positive
+from nfriction.cli.inputs import count, positive
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo
 from nfriction.papers.control import study
@@ -49,7 +49,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--warming", type=positive, default=30.0, help="time constant of it [s]")
     parser.add_argument("--units", type=common.natural, default=10, help="of the network")
     parser.add_argument("--forgetting", type=positive, default=10.0, help="of the learning [s]")
-    parser.add_argument("--seed", type=int, default=0, help="of the motor's torque")
+    parser.add_argument("--seed", type=count, default=0, help="of the motor's torque")
     parser.add_argument("--out", type=Path, default=Path("runs/online"), help="folder to write")
     given = parser.parse_args(argv)
     # A row of the table is a full block.

@@ -26,7 +26,8 @@ def train(argv: Sequence[str] | None) -> str:
         "--max-evaluations", type=common.natural, default=5000, help="limit for a search"
     )
     given = parser.parse_args(argv)
-    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
+    bench = common.read(given)
+    workspace = common.start(given, bench, search_evaluations=given.max_evaluations)
     if given.method == "gauss-newton":
         found = fit_by_class(workspace, bench, given.model)
     else:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import common
 
+from nfriction.cli.inputs import positive
 from nfriction.papers.reproduction.stages import fit_from_start, fit_searched
 
 MODELS = ("NCFM", "CFM", "CVFM", "LFM", "NLFM", "Stribeck")
@@ -25,13 +26,14 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument(
         "--method", choices=("output-error", "pattern", "sqp"), default="output-error"
     )
-    parser.add_argument("--horizon", type=float, default=5.0,
+    parser.add_argument("--horizon", type=positive, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument(
         "--max-evaluations", type=common.natural, default=5000, help="limit for a search"
     )
     given = parser.parse_args(argv)
-    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
+    bench = common.read(given)
+    workspace = common.start(given, bench, search_evaluations=given.max_evaluations)
     if given.method == "output-error":
         found = fit_from_start(workspace, bench, given.model)
     else:

@@ -42,8 +42,10 @@ def train(argv: Sequence[str] | None) -> str:
     given = parser.parse_args(argv)
     if given.model == WITHOUT_CLASSES and given.procedure == "papers":
         raise ValueError(f"{given.model} has no classes; give --procedure ours.")
-    workspace, bench = common.start(
+    bench = common.read(given)
+    workspace = common.start(
         given,
+        bench,
         controller_samples=given.samples,
         terms=tuple(given.terms),
         head_units=given.units,

@@ -23,7 +23,7 @@ import torch
 from matplotlib.figure import Figure
 
 from nfriction import datasets, load
-from nfriction.cli.inputs import positive
+from nfriction.cli.inputs import count, positive
 from nfriction.export import torchscript
 from nfriction.friction import model_names
 from nfriction.friction.laws import LINEAR, Law
@@ -51,8 +51,9 @@ def train(argv: Sequence[str] | None) -> str:
         "--max-steps", type=common.natural, default=100, help="of Bayesian regularisation"
     )
     parser.add_argument(
-        "--starts", type=int, default=1, help="number of starts; the best by evidence is kept"
-    )
+        "--starts", type=common.natural, default=1,
+        help="number of starts; the best by evidence is kept",
+    )  # fmt: skip
     parser.add_argument("--seconds", type=positive, help="duration of the motion; default 40 s")
     parser.add_argument(
         "--noise", type=positive, default=0.0,
@@ -61,7 +62,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument(
         "--every", type=common.natural, default=1, help="train on one of this many samples"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of encoders, noise and starts")
+    parser.add_argument("--seed", type=count, default=0, help="of encoders, noise and starts")
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
     law, controllers, samples = _data(given)

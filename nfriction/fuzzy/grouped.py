@@ -100,11 +100,13 @@ class LinearOutputModule(nn.Module):
 
 def targets_of(x: Tensor, y: Tensor, outputs: int) -> Tensor:
     """Targets as (samples, groups, outputs); ValueError unless finite and of the batch of `x`."""
-    if y.shape != (*x.shape[:-1], outputs) or not bool(torch.isfinite(y).all()):
+    if y.shape != (*x.shape[:-1], outputs):
         raise ValueError(
-            f"targets of inputs {tuple(x.shape)} must be finite and of shape "
-            f"{(*x.shape[:-1], outputs)}, got {tuple(y.shape)}."
+            f"targets of inputs {tuple(x.shape)} must be of shape {(*x.shape[:-1], outputs)}, "
+            f"got {tuple(y.shape)}."
         )
+    if not bool(torch.isfinite(y).all()):
+        raise ValueError("targets must be finite, got NaN or infinity; drop those samples.")
     return y.reshape(-1, *y.shape[-2:])
 
 

@@ -195,9 +195,13 @@ def test_unsound_sizes_and_samples_are_refused() -> None:
     with pytest.raises(ValueError, match="range"):
         network.init_range(1.0, 0.0)
     targets = surface(x)
-    for y in (targets.squeeze(1).T, targets[:40], torch.full_like(targets, torch.nan)):
+    for y, fault in (
+        (targets.squeeze(1).T, "must be of shape"),
+        (targets[:40], "must be of shape"),
+        (torch.full_like(targets, torch.nan), "must be finite, got NaN"),
+    ):
         for place in (network.solve_output, network.init_ols, AnfisRBF(1, 2, [2, 2], 2).solve_head):
-            with pytest.raises(ValueError, match="must be finite and of shape"):
+            with pytest.raises(ValueError, match=fault):
                 place(x, y)
 
 

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import re
 import runpy
 import signal
@@ -19,6 +20,9 @@ import torch
 from nfriction import ANCFM, CVFM, load, rollout, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
+from nfriction.papers.controller import load_rules, paper_controller
+from nfriction.papers.nffem import train_network
+from nfriction.papers.nffem.evidence import EvidenceState
 from nfriction.plant import PendulumChain, rigs
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
@@ -76,18 +80,62 @@ def test_every_offered_model_exists(script: str) -> None:
     assert set(offered) <= set(model_names())
 
 
-def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
-    def start(*words: str) -> None:
-        given = common.parser("").parse_args([*words, "--out", str(tmp_path)])
-        common.checkpoints(given)
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """A recording, in the folder of the file of its rig."""
+    rigs.write(PendulumChain([0.5], [0.4], [0.2], [0.01]), tmp_path / "rig.json")
+    time = np.arange(400) / 200
+    table = pd.DataFrame({"time": time, "q1": 3 + np.exp(-time) * np.cos(6 * time)})
+    table.to_csv(tmp_path / "run.csv", index=False)
+    return tmp_path / "run.csv"
 
-    start("--seed", "3")
-    start("--seed", "3", "--resume")
+
+def begin(log: Path, *words: object) -> None:
+    """What a trainer does before its fits."""
+    words = (log, "--rig", log.with_name("rig.json"), "--out", log.parent, *words)
+    given = common.parser("").parse_args([*map(str, words)])
+    common.start(given, common.read(given))
+
+
+def test_checkpoints_of_other_options_are_refused(log: Path) -> None:
+    begin(log, "--seed", "3")
+    begin(log, "--seed", "3", "--resume")
     with pytest.raises(ValueError, match="other options"):
-        start("--seed", "4", "--resume")
-    (tmp_path / "checkpoints" / "stages" / "NLFM.json").write_text("of an earlier run")
-    start("--seed", "4")  # anew
-    assert not (tmp_path / "checkpoints" / "stages" / "NLFM.json").exists()
+        begin(log, "--seed", "4", "--resume")
+
+
+@pytest.mark.parametrize(("name", "old", "new"), [("run.csv", ",4.0", ",4.001"),
+                                                  ("rig.json", "0.4", "0.5")])  # fmt: skip
+def test_checkpoints_of_a_file_that_has_changed_are_refused(
+    log: Path, name: str, old: str, new: str
+) -> None:
+    begin(log)
+    path = log.with_name(name)
+    before = path.read_text()
+    path.write_text(before.replace(old, new))
+    with pytest.raises(ValueError, match=rf"other contents of \S*{name}; restore"):
+        begin(log, "--resume")
+    path.write_text(before)
+    begin(log, "--resume")
+
+
+def test_checkpoints_are_deleted_only_after_a_finished_run_and_for_good_data(log: Path) -> None:
+    begin(log)
+    begin(log)  # no result is lost yet
+    kept = log.with_name("checkpoints") / "stages" / "NLFM.json"
+    kept.write_text("a result")
+    with pytest.raises(ValueError, match=r"did not finish.*--resume, or delete"):
+        begin(log)
+    common.finished(common.parser("").parse_args(["--out", str(log.parent)]))
+    for wrong in (["--rig", "no.json"], ["--angles", "x"], ["--rig", "tlrip"]):
+        with pytest.raises((ValueError, OSError)):
+            begin(log, *wrong)
+    with pytest.raises(SystemExit, match="--joint must be 1 to 1, got 2"):
+        train("evolve_rules.py", log, "--rig", log.with_name("rig.json"), "--joint", "2",
+              "--out", log.parent)  # fmt: skip
+    assert kept.exists()
+    begin(log)
+    assert not kept.exists()
 
 
 def test_recordings_need_a_rig(tmp_path: Path) -> None:
@@ -126,6 +174,51 @@ def test_networks_are_trained_on_the_supervised_set(
     assert adaptive is not None or (spread > 0).all()
     for name in (f"{made}.pt", f"{made}-loss.png", f"{made}-outputs.png"):
         assert (tmp_path / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+def test_an_interrupted_training_of_networks_writes_no_model(
+    tmp_path: Path,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    joint: int,
+) -> None:
+    monkeypatch.setattr("nfriction.datasets.cache_folder", lambda: cache)
+    begun = []
+
+    def interrupt(state: EvidenceState) -> None:
+        begun.extend([state] if state.step == 1 else [])
+        if len(begun) == joint:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(train_network, "recorded_losses", lambda names: ({}, interrupt))
+    with pytest.raises(SystemExit) as ended:
+        train("train_supervised.py", "--seconds", "3", "--units", "3", "--max-steps", "2",
+              "--out", tmp_path)  # fmt: skip
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "\ninterrupted\n"
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_closed_output_is_no_error() -> None:
+    script = f"import sys; sys.path.insert(0, {str(TRAINERS)!r}); import common; common.run(str)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.communicate()[1] == b""
+    assert process.returncode == 141
+
+
+@pytest.mark.parametrize("script", [*SCRIPTS, "evolve_rules.py", "learn_online.py"])
+def test_a_negative_seed_is_refused_by_name(
+    script: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        train(script, "--seed", "-1")
+    assert "argument --seed: must be a whole number from 0, got '-1'" in capsys.readouterr().err
 
 
 def test_networks_tolerate_noise_on_what_they_learn(
@@ -209,6 +302,12 @@ def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
     assert (tmp_path / "arm.c").exists()
 
 
+def test_written_rules_are_read_back(tmp_path: Path) -> None:
+    rules, path = paper_controller(3).rule_base, tmp_path / "rules.json"
+    runpy.run_path(str(TRAINERS / "evolve_rules.py"))["write_rules"](rules, path)
+    assert load_rules(path) == rules
+
+
 @pytest.mark.slow
 def test_rules_evolve_to_a_front_and_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -222,6 +321,8 @@ def test_rules_evolve_to_a_front_and_go_on(
     assert table["rules"].iloc[1:].is_monotonic_increasing
     assert table["training error [mN m]"].iloc[1:].is_monotonic_decreasing
     assert (tmp_path / "pareto.png").stat().st_size > 0
+    files = [tmp_path / f"candidate-{number}.json" for number in range(1, len(table))]
+    assert [len(load_rules(file).rules) for file in files] == table["rules"].iloc[1:].to_list()
     train(*words, "--resume")
     assert capsys.readouterr().out == first
 

@@ -120,32 +120,49 @@ def read_samples(
     """Samples from the folder to which `build_samples` wrote them.
 
     Raises:
-        ValueError: if they were changed since, or tables of one's own lack columns, differ in time
-            or contain cells that are not finite numbers.
+        ValueError: if they were changed since, or tables of one's own lack columns, differ in time,
+            are not in its order, or contain cells that are not finite numbers or negative speeds.
     """
     folder = Path(folder)
     tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
     outputs = tuple(name for name in map(str, tables[0]) if name not in ("time", *INPUTS))
+    found: list[NDArray[np.float64]] = []
     for name, table in zip(joint_names, tables, strict=True):
         where, wanted = f"{folder / name}.csv.gz", ["time", *INPUTS, *outputs]
         if {*table} != {*wanted} or not outputs:
             columns = ", ".join(map(str, table))
             raise ValueError(f"{where} needs the columns {', '.join(wanted)}, got {columns}.")
-        cells = table.apply(pd.to_numeric, errors="coerce")
-        if not len(cells) or not np.isfinite(cells).all(axis=None):
-            raise ValueError(f"{where} needs rows of finite numbers only.")
-        if not table["time"].equals(tables[0]["time"]):
+        # Columns of true and false would count as 1 and 0.
+        numbers = table.select_dtypes(exclude="bool").apply(pd.to_numeric, errors="coerce")
+        cells = numbers.reindex(columns=wanted).to_numpy(dtype=np.float64)
+        wrong = [f"{table[wanted[column]][row]} for {wanted[column]} in row {row + 1}"
+                 for row, column in np.argwhere(~np.isfinite(cells))[:1]]  # fmt: skip
+        if wrong or not len(cells):
+            raise ValueError(
+                f"{where} needs rows of finite numbers only, got {', '.join(wrong) or 'no row'}; "
+                "correct or drop such rows."
+            )
+        if found and not np.array_equal(cells[:, 0], found[0][:, 0]):
             raise ValueError(f"{where} needs the times of {joint_names[0]}.")
-    x, y = (
-        torch.tensor(np.stack([table[list(names)].to_numpy() for table in tables], 1))
-        for names in (INPUTS, outputs)
-    )
-    time = tables[0]["time"].to_numpy(dtype=np.float64)
-    found = ControllerSamples(tuple(joint_names), outputs, time, x, y)
+        if len(late := np.flatnonzero(np.diff(cells[:, 0]) < 0)):
+            before, after = cells[late[0] : late[0] + 2, 0]
+            raise ValueError(
+                f"{where} needs rows in order of time, got {after:g} after {before:g} s "
+                f"in row {late[0] + 2}; sort them."
+            )
+        if cells[:, 1].min() < 0:
+            raise ValueError(
+                f"{where} needs speed = |velocity|, at least 0, got {cells[:, 1].min():g}; "
+                "take the absolute value."
+            )
+        found.append(cells)
+    whole = np.stack(found, 1)
+    x, y = torch.tensor(whole[..., 1:3]), torch.tensor(whole[..., 3:])
+    samples = ControllerSamples(tuple(joint_names), outputs, whole[:, 0, 0].copy(), x, y)
     path = folder / CHECKSUMS
-    if path.exists() and parse_json(path.read_bytes()) != checksums(found):
+    if path.exists() and parse_json(path.read_bytes()) != checksums(samples):
         raise ValueError(f"{folder}: files differ from {CHECKSUMS}; build them again.")
-    return found
+    return samples
 
 
 def checksums(samples: ControllerSamples) -> dict[str, str]:

@@ -64,14 +64,22 @@ def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Pat
     table = tables["joint3"]
     for wrong, fault in (
         (table.rename(columns={"speed": "velocity"}), "the columns time, speed, acceleration, B"),
-        (table.assign(B=np.nan), "rows of finite numbers"),
-        (table.assign(B="x"), "rows of finite numbers"),
-        (table[:0], "rows of finite numbers"),
+        (table.assign(B=np.nan), "rows of finite numbers only, got nan for B in row 1"),
+        (table.assign(B="x"), "rows of finite numbers only, got x for B in row 1"),
+        (table.assign(B=True), "rows of finite numbers only, got True for B in row 1"),
+        (table[:0], "rows of finite numbers only, got no row"),
+        (table.assign(speed=-table["speed"] - 1), r"speed = \|velocity\|, at least 0, got -\d"),
         (table[:-1], "the times of joint2"),
         (table.assign(time=2 * table["time"]), "the times of joint2"),
     ):
         with pytest.raises(ValueError, match=f"joint3.csv.gz needs {fault}"):
             read(joint3=wrong)
+    # Joints that agree in their times, in a wrong order.
+    turned = {name: table[::-1] for name, table in tables.items()}
+    with pytest.raises(
+        ValueError, match=r"order of time, got 0.198 after 0.199 s in row 2; sort them"
+    ):
+        read(**turned)
 
 
 @pytest.mark.parametrize("name", [n for n in datasets.names() if n.endswith("_twin")])

@@ -1,8 +1,8 @@
 """The twins are what their cards say: sound physics, an honest encoder, the same bytes again."""
 
-import importlib.util
 import math
 import re
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -235,15 +235,34 @@ def test_test_motions_are_predictable(name: str) -> None:
         assert np.abs(shifted.q - truth.q).max() < 0.05, label
 
 
+def build_script(*words: object) -> int:
+    """Run `datasets/build.py` with these words."""
+    main = runpy.run_path(str(DATASETS / "build.py"))["main"]
+    return int(main([*map(str, words)]))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
 def test_builder_script(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    spec = importlib.util.spec_from_file_location("build", DATASETS / "build.py")
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    assert script.main([name, "--out", str(tmp_path), "--quick"]) == 0
+    assert build_script(name, "--out", tmp_path, "--quick") == 0
     said, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
     assert re.findall(r"10000 samples", said) == ["10000 samples"] * len(files)
     assert len(files) == {"experiment_twin": 1, "rtip_twin": 4, "tlrip_controller": 3}[name]
+
+
+@pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
+def test_builder_script_refuses_what_would_spoil_files(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "train_upright.csv.gz").write_bytes(b"of the twin of the TLRIP")
+    file = tmp_path / "train_upright.csv.gz"
+    for words, fault in (
+        (["--out", tmp_path], "of this data set, .* with train_upright.csv.gz of another; choose"),
+        (["--out", file], "is a file; choose another folder"),
+        (["--out", file / "folder"], "is a file; choose another folder"),
+        (["--seed", "-1"], "--seed: must be a whole number from 0, got '-1'"),
+    ):
+        with pytest.raises(SystemExit):
+            build_script(name, "--quick", *words)
+        assert re.search(fault, capsys.readouterr().err)
+    assert [*tmp_path.iterdir()] == [file]
