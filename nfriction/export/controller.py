@@ -335,4 +335,5 @@ def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
             f"`torque_limit` must be positive and finite [N m], one number or one for each of "
             f"{joints} joints, got {given!r}."
         )
-    return limit.expand(joints).clone()
+    # No `expand`, whose strides a file of torch would keep.
+    return limit * torch.ones(joints, dtype=torch.float64)
