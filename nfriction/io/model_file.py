@@ -11,7 +11,7 @@ import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -108,23 +108,14 @@ def parameter_hash(state: Mapping[str, Tensor]) -> str:
 
 def check_joints(info: ModelInfo, joints: int) -> None:
     """Refuse names, or a rig, of another number of joints; only `load_plant` needs a sound rig."""
-    names = info.joint_names
+    names, count = info.joint_names, joints
     if isinstance(names, str) or len(names) not in (0, joints):
-        given = shortened(repr(names if isinstance(names, str) else list(names)), 80)
-        raise ValueError(f"`joint_names` must name {joints} joints, got {given}.")
-    if info.rig is None:
-        return
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            count = from_dict(info.rig).joints
-    except _UNFIT:
-        return
+        raise ValueError(f"`joint_names` must name {joints} joints, got {shortened(names, 80)}.")
+    with suppress(*_UNFIT), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        count = from_dict(info.rig or {}).joints
     if count != joints:
-        raise ValueError(
-            f"`rig` has {count} joints, the model {joints}: give the rig of the model's fit, or "
-            "none."
-        )
+        raise ValueError(f"`rig` has {count} joints, the model {joints}: give that of its fit.")
 
 
 def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:

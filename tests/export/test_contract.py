@@ -218,7 +218,10 @@ def test_hostile_metadata_are_refused(text: str, message: str) -> None:
     ("info", "message"),
     [
         (ModelInfo(joint_names=["a"]), "name 2 joints"),
-        (ModelInfo(rig=rigs.tlrip().to_dict()), "`rig` has 3 joints, the model 2: give the rig"),
+        (
+            ModelInfo(rig=rigs.tlrip().to_dict()),
+            "`rig` has 3 joints, the model 2: give that",
+        ),
     ],
 )
 def test_names_and_rig_must_have_the_models_joints(
