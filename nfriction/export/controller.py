@@ -248,9 +248,8 @@ class Controller(nn.Module):
         """The torque alone, under the same contract; RuntimeError where it needs a memory."""
         if self.remembers:
             raise RuntimeError(
-                "the friction of this model depends on earlier samples, so it has no torque of one "
-                "sample: start with `state = module.initial_state(...)`, then call `tau_f, "
-                "coefficients, status, state = module.step(..., state)` for every sample."
+                "this friction depends on earlier samples: call `module.initial_state` once, then "
+                "`module.step` with the state for every sample."
             )
         qd_seen, qdd_seen, _ = self.seen(qd, qdd)
         tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
@@ -335,5 +334,4 @@ def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
             f"`torque_limit` must be positive and finite [N m], one number or one for each of "
             f"{joints} joints, got {given!r}."
         )
-    # No `expand`, whose strides a file of torch would keep.
-    return limit * torch.ones(joints, dtype=torch.float64)
+    return limit * torch.ones(joints, dtype=torch.float64)  # files of torch keep `expand`'s strides

@@ -58,12 +58,11 @@ def torchscript(
     """Write a model as frozen TorchScript, with all joints in stacked tensors.
 
     The artefact is `module(qd, qdd, load) -> tau_f`, every argument (*batch, joint) in SI and
-    float64, on the CPU; with a memory (such as heat) that raises an error, as the torque depends on
-    earlier samples. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
-    with a memory `step(qd, qdd, load, state)` from `initial_state(qd, qdd)`, with the filter
-    `step(q, load, state)` from `initial_state(q)`, both with the next state as a fourth result. The
-    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. The file is loaded
-    again and compared with the model before it is put in place.
+    float64, on the CPU. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
+    with a memory, which the first call refuses, `step(qd, qdd, load, state)` from
+    `initial_state(qd, qdd)`, with the filter `step(q, load, state)` from `initial_state(q)`, both
+    with the next state as a fourth result. The metadata (see `Contract`) are JSON under
+    `nfriction.json` in `_extra_files`. The file is compared with the model before it is kept.
 
     Args:
         path: file to write, usually `.pt`; missing folders are made.

@@ -52,9 +52,10 @@ extern "C" {
 typedef REAL nf_real;
 
 {% if state_size %}
-/* State of the coefficients from earlier samples. */
+/* State of the coefficients from earlier samples{{ ", in double, as float would lose its small steps" if memory != real }}. */
+typedef {{ memory }} nf_memory;
 typedef struct {
-    nf_real memory[NF_JOINTS * NF_STATE_SIZE];
+    nf_memory memory[NF_JOINTS * NF_STATE_SIZE];
 } nf_state;
 
 /* Memory before the first sample, whose motion is given. */
