@@ -210,10 +210,8 @@ def run_verify(arguments: argparse.Namespace) -> int:
         )
     for difference in verdict.differences:
         print(difference)
-    verb = "is" if verdict.passed else "IS NOT"
-    print(
-        f"{arguments.artefact.name} {verb} {arguments.model.name} (errors relative to full scale)"
-    )
+    where, verb = arguments.artefact.name, "is" if verdict.passed else "IS NOT"
+    print(f"{where} {verb} {arguments.model.name} (errors relative to full scale)")
     return 0 if verdict.passed else 1
 
 

@@ -353,8 +353,7 @@ def _function(name: str, program: Program, outputs: Sequence[str], dialect: Cont
             targets.append(f"c[{i % columns}][{i // columns}]" if output == "c" else f"next[{i}]")
             step = [x for x in node.args if elements.get(x.number) != f"last[{i}]"]
             if dialect.real == "float" and output == "next" and node.op == "add" and len(step) == 1:
-                # The state may be in double, which a sum in float would waste.
-                sums.append(f"next[{i}] += last[{i}];")
+                sums.append(f"next[{i}] += last[{i}];")  # in double where the state is
                 node = step[0]
             nodes.append(node)
     if dialect.real == "float":
