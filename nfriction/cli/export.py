@@ -97,7 +97,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     info = replace(info, sample_time=arguments.sample_time or info.sample_time)
     limits, cutoff = len(arguments.torque_limit or [0]), arguments.cutoff or 20.0
     if limits not in (1, model.joints):
-        raise UsageError(f"--torque-limit must be 1 number or {model.joints}, got {limits}.")
+        raise UsageError(f"--torque-limit needs one number or one per joint, got {limits}.")
     step = info.sample_time or 0.0
     if arguments.with_filter and cutoff * step >= 0.5:
         raise UsageError(

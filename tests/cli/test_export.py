@@ -168,7 +168,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--format", ","], "needs some of"),
         (["--format", "mjcf"], "--recording"),
         (["--torque-limit", "-1"], "positive numbers"),
-        (["--torque-limit", "1,2"], "--torque-limit must be 1 number or 3, got 2"),
+        (["--torque-limit", "1,2"], "--torque-limit needs one number or one per joint, got 2"),
         (["--cutoff", "1,2"], "must be one number"),
         (
             ["--with-filter", "--cutoff", "900"],
