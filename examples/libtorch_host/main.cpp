@@ -87,18 +87,30 @@ static bool verify(torch::jit::Module &module, const Json &metadata) {
     return error <= tolerance && edges == 0;
 }
 
-// One call of a control loop: one sample of every joint, only the torque.
-static std::vector<double> time_calls(torch::jit::Module &module, int64_t joints, int calls) {
+// One call of a control loop: one sample of every joint; only the torque, or a step with a state.
+static std::vector<double> time_calls(torch::jit::Module &module, const Json &metadata, int calls) {
+    const auto joints = static_cast<int64_t>(metadata["joints"].value());
+    const bool has_state = metadata["state_size"].value() > 0;
     const auto full = [joints](double value) {
         return torch::full({joints}, value, torch::kFloat64);
     };
     Values sample{full(1.0), full(-5.0), full(1.0)};
+    if (metadata["inputs"].list.size() == 2) sample.erase(sample.begin());  // position and load
+    if (has_state)
+        sample.push_back(module.get_method("initial_state")({sample.begin(), sample.end() - 1}));
     double *qd = sample[0].toTensor().data_ptr<double>();
     std::vector<double> microseconds;
     for (int call = -1000; call < calls; ++call) {  // the first thousand warm up
         std::fill(qd, qd + joints, std::sin(0.01 * call));
         const auto start = std::chrono::steady_clock::now();
-        const double tau_f = module.forward(sample).toTensor().data_ptr<double>()[0];
+        double tau_f;
+        if (has_state) {
+            const auto found = module.get_method("step")(sample).toTuple()->elements();
+            tau_f = found[0].toTensor().data_ptr<double>()[0];
+            sample.back() = found[3];
+        } else {
+            tau_f = module.forward(sample).toTensor().data_ptr<double>()[0];
+        }
         const auto stop = std::chrono::steady_clock::now();
         if (std::isnan(tau_f)) throw std::runtime_error("a sound sample gives no torque");
         if (call >= 0)
@@ -134,8 +146,7 @@ int main(int argc, char **argv) {
                     static_cast<long long>(metadata["joints"].value()));
         if (!verify(module, metadata)) return 1;
         const int calls = argc > 2 ? std::max(1, std::atoi(argv[2])) : 20000;
-        const auto joints = static_cast<int64_t>(metadata["joints"].value());
-        const auto microseconds = time_calls(module, joints, calls);
+        const auto microseconds = time_calls(module, metadata, calls);
         report(microseconds);
         if (argc > 3) {
             std::ofstream file(argv[3]);

@@ -36,9 +36,10 @@ def add_export(commands: Commands) -> None:
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
     parser.add_argument("--name", type=_identifier, metavar="NAME",
                         help="name of the files, and prefix of all C functions (default: that of "
-                        "the model file)")  # fmt: skip
+                        "the model file, in C its first 24 letters)")  # fmt: skip
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
-                        help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
+                        help=f"precision of {' and '.join(IN_SINGLE)}; onnx has its filter only in "
+                        "float64")  # fmt: skip
     parser.add_argument("--torque-limit", type=inputs.positives, metavar="LIMIT,...",
                         help="limit of the output torque, one number or one per joint")  # fmt: skip
     parser.add_argument("--sample-time", type=inputs.positive, metavar="SECONDS",
@@ -94,22 +95,34 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     info = replace(info, sample_time=arguments.sample_time or info.sample_time)
+    limits, cutoff = len(arguments.torque_limit or [0]), arguments.cutoff or 20.0
+    if limits not in (1, model.joints):
+        raise UsageError(f"--torque-limit needs one number or one per joint, got {limits}.")
+    step = info.sample_time or 0.0
+    if arguments.with_filter and cutoff * step >= 0.5:
+        raise UsageError(
+            f"--cutoff must be below half the sampling frequency, {0.5 / step:g} Hz, got "
+            f"{cutoff:g}: lower it, or give the controller's --sample-time."
+        )
     if info.rating and not info.rating.startswith("good"):
         warnings.warn(f"{arguments.model.name} has the rating {info.rating!r}.", stacklevel=1)
     check_writable(arguments.out)
-    for target in arguments.format:
-        if target in SIMULATORS:
-            _write_simulator(target, model, info, arguments)
-        else:
-            for path in _write_controller(target, model, info, arguments):
-                print(f"wrote {path}")
+    # In a folder aside: what was there before stays unless all targets succeed.
+    out = arguments.out
+    with TemporaryDirectory(dir=out) as folder:
+        arguments.out = Path(folder)
+        for target in arguments.format:
+            write = _write_simulator if target in SIMULATORS else _write_controller
+            write(target, model, info, arguments)
+        for path in sorted(arguments.out.iterdir()):
+            print(f"wrote {path.replace(out / path.name)}")
     return 0
 
 
 def _write_controller(
     target: str, model: "FrictionModel", info: "ModelInfo", arguments: argparse.Namespace
-) -> list[Path]:
-    """Write an artefact; returns its files."""
+) -> None:
+    """Write an artefact."""
     from nfriction import export
     from nfriction.export.c_dialect import is_identifier
 
@@ -123,22 +136,18 @@ def _write_controller(
     if target in IN_SINGLE:
         options["dtype"] = arguments.dtype
     stem = arguments.name or arguments.model.stem
-    if target == "c":
-        name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
-        name = name if is_identifier(name) else f"nf_{name}"
-        # What was there before stays if the new code differs from its model.
-        with TemporaryDirectory(dir=arguments.out) as folder:
-            proven = export.c(model, folder, info, name=name, **options)
-            _prove(proven[0], model, info)
-            paths = [path.replace(arguments.out / path.name) for path in proven]
-        if arguments.online:
-            from nfriction.papers.nffem.online import OnlineOptions, write_online
+    if target != "c":
+        file = f"{stem}{CONTROLLERS[target]}"
+        getattr(export, target)(model, arguments.out / file, info, **options)
+        return
+    name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
+    name = arguments.name or (name if is_identifier(name) else f"nf_{name[:21]}")
+    _prove(export.c(model, arguments.out, info, name=name, **options)[0], model, info)
+    if arguments.online:
+        from nfriction.papers.nffem.online import OnlineOptions, write_online
 
-            learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
-            paths += write_online(model, arguments.out, learning, name=f"{name}_online")
-        return paths
-    writer = getattr(export, target)
-    return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
+        learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
+        write_online(model, arguments.out, learning, name=f"{name}_online")
 
 
 def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
@@ -178,9 +187,8 @@ def _write_simulator(
     recordings = inputs.read_recordings(arguments.recording, plant, arguments)
     motions = [kalman_smoother(r.time, r.joint_coordinates(plant).q) for r in recordings]
     path = arguments.out / f"{arguments.model.stem}{SIMULATORS[target]}"
-    writer = getattr(export, target)
-    print(writer(model, path, motions, info, load=plant.load, patch=arguments.patch))
-    print(f"wrote {path}")
+    write = getattr(export, target)
+    print(write(model, path, motions, info, load=plant.load, patch=arguments.patch))
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
@@ -202,9 +210,8 @@ def run_verify(arguments: argparse.Namespace) -> int:
         )
     for difference in verdict.differences:
         print(difference)
-    where = Path(arguments.artefact).name
-    verb = "is" if verdict.passed else "IS NOT"
-    print(f"{where} {verb} {Path(arguments.model).name} (errors relative to full scale)")
+    where, verb = arguments.artefact.name, "is" if verdict.passed else "IS NOT"
+    print(f"{where} {verb} {arguments.model.name} (errors relative to full scale)")
     return 0 if verdict.passed else 1
 
 
@@ -227,6 +234,7 @@ def _identifier(text: str) -> str:
 
     if not is_identifier(text):
         raise argparse.ArgumentTypeError(
-            f"must be letters, digits and _, begin with a letter and be no C keyword, got {text!r}"
+            "must be at most 31 letters, digits and _, begin with a letter and be no C keyword, "
+            f"got {text!r}"
         )
     return text

@@ -57,6 +57,7 @@ def source_of(
         "joints": controller.joints,
         "coefficients": controller.coefficient_count,
         "state_size": controller.memory_size,
+        "memory": "double" if hasattr(controller.model.schedule, "cooling_time") else dialect.real,
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
         "loaded": controller.loaded,
@@ -345,20 +346,26 @@ def _schedule(controller: Controller, dialect: ControllerC) -> str:
 
 
 def _function(name: str, program: Program, outputs: Sequence[str], dialect: ControllerC) -> str:
-    targets, nodes = [], []
+    targets, nodes, sums, elements = [], [], [], _elements(program)
     for output, port in zip(outputs, program.outputs, strict=True):
         columns = port.shape[-1]
         for i, node in enumerate(port.nodes):
             targets.append(f"c[{i % columns}][{i // columns}]" if output == "c" else f"next[{i}]")
+            step = [x for x in node.args if elements.get(x.number) != f"last[{i}]"]
+            if dialect.real == "float" and output == "next" and node.op == "add" and len(step) == 1:
+                sums.append(f"next[{i}] += last[{i}];")  # in double where the state is
+                node = step[0]
             nodes.append(node)
+    if dialect.real == "float":
+        elements = {k: x.replace("last", "(float)last") for k, x in elements.items()}
     arguments = [
-        f"const REAL *{p.name}" if p.name == "last" else f"const REAL {p.name}[NF_JOINTS]"
+        f"const nf_memory *{p.name}" if p.name == "last" else f"const REAL {p.name}[NF_JOINTS]"
         for p in program.inputs
     ]
-    kinds = {"c": "REAL c[NF_COEFFICIENTS][NF_JOINTS]", "next": "REAL *next"}
+    kinds = {"c": "REAL c[NF_COEFFICIENTS][NF_JOINTS]", "next": "nf_memory *next"}
     arguments += [kinds[output] for output in sorted(outputs, reverse=True)]
     head = dialect.own(f"static void {name}(\n    {', '.join(arguments)})")
-    lines = _assignments(targets, nodes, _elements(program), dialect)
+    lines = _assignments(targets, nodes, elements, dialect) + sums
     lines += [f"(void){port.name};" for port in program.inputs]
     return f"{head}\n{_braces(lines, '')}\n"
 

@@ -245,15 +245,14 @@ class Controller(nn.Module):
         return state
 
     def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
-        """The torque alone, under the same contract; a memory is that after a first sample."""
+        """The torque alone, under the same contract; RuntimeError where it needs a memory."""
+        if self.remembers:
+            raise RuntimeError(
+                "this friction depends on earlier samples: call `module.initial_state` once, then "
+                "`module.step` with the state for every sample."
+            )
         qd_seen, qdd_seen, _ = self.seen(qd, qdd)
-        if self.loaded:
-            start = self.model.schedule.initial_state(qd_seen, qdd_seen)
-            first = self.model.schedule.advance_loaded(qd_seen, qdd_seen, load, start)
-            coefficients = self.model.schedule.coefficients_from(qd_seen, qdd_seen, first)
-        else:
-            coefficients = self.model.schedule(qd_seen, qdd_seen)
-        tau_f = self.model.torque(qd, load, coefficients)
+        tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
         held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
         # Zero times a non-finite number is NaN: a third of the operations of comparisons.
         held = torch.addcmul(held, qd, qdd, value=0.0)
@@ -335,4 +334,4 @@ def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
             f"`torque_limit` must be positive and finite [N m], one number or one for each of "
             f"{joints} joints, got {given!r}."
         )
-    return limit.expand(joints).clone()
+    return limit * torch.ones(joints, dtype=torch.float64)  # files of torch keep `expand`'s strides

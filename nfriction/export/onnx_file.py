@@ -26,6 +26,7 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import Controller, controller_of, for_single_precision
 from nfriction.export.torch_files import METADATA, another_program, exported, run_from_nan, silent
+from nfriction.friction.heat import Heated
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.version import __version__
@@ -279,12 +280,18 @@ def onnx(
     _package()
     if dtype == "float32" and with_filter:
         # Differences of positions over a millisecond have half the digits of the positions.
-        raise ValueError(
-            'the filter needs dtype="float64"; or filter externally, in double precision.'
-        )
+        raise ValueError("the filter of ONNX needs float64, got float32; or filter outside.")
     controller = controller_of(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
+    heat = controller.model.schedule
+    # Half a digit in each step of a time constant may add up to 0.1 % of the heat.
+    slow = isinstance(heat, Heated) and heat.cooling_time * 2.0**-24 > 1e-3 * heat.sample_time
+    if dtype == "float32" and slow:
+        raise ValueError(
+            f"heat with a time constant of {heat.cooling_time:g} s loses its steps of "
+            f"{heat.sample_time:g} s in float32: export ONNX in float64, or C."
+        )
     contract = contract_of(model, controller, info, dtype=dtype)
     file = _file(controller, dtype)
     file.graph.name = str(contract.description["model"])

@@ -19,7 +19,7 @@ from nfriction.friction.inputs import has_input
 from nfriction.friction.memory import DAHL, LUGRE
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
-from nfriction.io.model_file import ModelInfo
+from nfriction.io.model_file import ModelInfo, check_joints
 from nfriction.plant.robot_file import parse_xml
 from nfriction.signals import Motion
 
@@ -227,6 +227,7 @@ _SNIPPETS = {
 
 def joint_names(model: FrictionModel, info: ModelInfo) -> tuple[str, ...]:
     """The joints' names, or numbers from 1 if they have none."""
+    check_joints(info, model.joints)
     return tuple(info.joint_names) or tuple(f"joint{j + 1}" for j in range(model.joints))
 
 

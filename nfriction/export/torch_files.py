@@ -59,10 +59,10 @@ def torchscript(
 
     The artefact is `module(qd, qdd, load) -> tau_f`, every argument (*batch, joint) in SI and
     float64, on the CPU. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
-    with a memory `step(qd, qdd, load, state)` from `initial_state(qd, qdd)`, with the filter
-    `step(q, load, state)` from `initial_state(q)`, both with the next state as a fourth result. The
-    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. The file is loaded
-    again and compared with the model before it is put in place.
+    with a memory, which the first call refuses, `step(qd, qdd, load, state)` from
+    `initial_state(qd, qdd)`, with the filter `step(q, load, state)` from `initial_state(q)`, both
+    with the next state as a fourth result. The metadata (see `Contract`) are JSON under
+    `nfriction.json` in `_extra_files`. The file is compared with the model before it is kept.
 
     Args:
         path: file to write, usually `.pt`; missing folders are made.
@@ -86,7 +86,8 @@ def torchscript(
     def runner(path: Path) -> Runner:
         with silent():
             module = torch.jit.load(str(path))
-        _check_torque(controller, module, contract)
+        if not controller.remembers:
+            _check_torque(controller, module, contract)
         return _script_runner(module, controller)
 
     content = _script(controller, contract.to_json())

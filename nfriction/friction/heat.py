@@ -93,9 +93,10 @@ class Heated(Schedule):
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         held = self.coefficients_from(qd, qdd, state)
         power = self._power(qd, held)
-        kept = torch.exp(-torch.exp(self.log_sample_time - self.log_cooling_time))
+        # As an increment: in single precision the factor that remains would round to 1.
+        lost = -torch.expm1(-torch.exp(self.log_sample_time - self.log_cooling_time))
         gained = torch.exp(self.log_sample_time - self.log_heat_capacity) * power
-        return (kept * state.select(-1, 0) + gained).unsqueeze(-1)
+        return state + (gained - lost * state.select(-1, 0)).unsqueeze(-1)
 
     def _power(self, qd: Tensor, coefficients: Tensor) -> Tensor:
         """Power that friction dissipates [W]; none where it drives."""

@@ -9,8 +9,9 @@ import copy
 import hashlib
 import json
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -105,12 +106,21 @@ def parameter_hash(state: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
+def check_joints(info: ModelInfo, joints: int) -> None:
+    """Refuse names, or a rig, of another number of joints; only `load_plant` needs a sound rig."""
+    names, count = info.joint_names, joints
+    if isinstance(names, str) or len(names) not in (0, joints):
+        raise ValueError(f"`joint_names` must name {joints} joints, got {shortened(names, 80)}.")
+    with suppress(*_UNFIT), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        count = from_dict(info.rig or {}).joints
+    if count != joints:
+        raise ValueError(f"`rig` has {count} joints, the model {joints}: give that of its fit.")
+
+
 def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
     """Everything in a model file except the parameters, as plain JSON."""
-    if info.joint_names and len(info.joint_names) != model.joints:
-        raise ValueError(
-            f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
-        )
+    check_joints(info, model.joints)
     torque = unit_for("N m", info.unit)
     return {
         "format": FORMAT,
@@ -188,7 +198,7 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
 
     Raises:
         TypeError: it is not a friction model.
-        ValueError: a parameter is not finite, or `info` is not plain JSON.
+        ValueError: a parameter is not finite, or `info` is not plain JSON or has other joints.
         OSError: the file cannot be written.
     """
     require_model(model)
@@ -260,25 +270,17 @@ def load_plant(path: str | Path) -> Plant:
     Raises:
         ModelFileError: the file is absent or damaged, or does not describe the mechanism.
     """
-    content = read_model_file(path)
-    rig, joints = content["rig"], content["joints"]
+    rig = read_model_file(path)["rig"]
     with _naming(path):
         if rig is None:
             raise ValueError(
                 "does not describe the mechanism; save with "
                 "`ModelInfo(rig=plant.to_dict())` to include it."
             )
-        mass = rig.get("mass")
-        # The matrices of a chain grow with the square of its links.
-        if isinstance(mass, list) and len(mass) > joints:
-            raise ValueError(f"`rig` has {len(mass)} masses, the model {joints} joints.")
         try:
-            plant = from_dict(rig)
+            return from_dict(rig)
         except _UNFIT as error:
             raise ValueError(f"`rig` is no mechanism ({shortened(repr(error), 80)}).") from error
-        if plant.joints != joints:
-            raise ValueError(f"`rig` has {plant.joints} joints, the model {joints}.")
-        return plant
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
@@ -308,9 +310,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         if not is_intact(content):
             raise ValueError("the checksum does not match; damaged or edited.")
         _check_sizes(content, size)
-        info = _info(content)
-        if len(info.joint_names) not in (0, content["joints"]):
-            raise ValueError(f"`joint_names` must be {content['joints']} texts, or none.")
+        check_joints(_info(content), content["joints"])
         _check_depth([v for k, v in content.items() if k != "state"])
     return content
 

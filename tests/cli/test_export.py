@@ -168,9 +168,24 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--format", ","], "needs some of"),
         (["--format", "mjcf"], "--recording"),
         (["--torque-limit", "-1"], "positive numbers"),
-        (["--torque-limit", "1,2"], "torque_limit"),
+        (["--torque-limit", "1,2"], "--torque-limit needs one number or one per joint, got 2"),
         (["--cutoff", "1,2"], "must be one number"),
-        (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
+        (
+            ["--with-filter", "--cutoff", "900"],
+            "--cutoff must be below half the sampling frequency",
+        ),
+        (["--with-filter", "--sample-time", "0.1"], "frequency, 5 Hz, got 20"),
+        (
+            ["--format", "c,torchscript,onnx", "--with-filter", "--dtype", "float32"],
+            "the filter of ONNX needs float64",
+        ),
+        (["--name", 32 * "a", "--format", "c"], "at most 31 letters"),
+        (
+            ["--name", 25 * "a", "--format", "c", "--online", "0.1"],
+            "up to 31 letters, got '" + 25 * "a" + "_online'",
+        ),
+        (["--format", "c,urdf", "--recording", "model.json"], "lfm.json"),
+        (["--format", "c", "--online", "0.1"], 'network="rbf"'),
         (["--online", "0.1"], "--online needs c in"),
         (["--online", "0.1,0.2", "--format", "c"], "--online: must be one number"),
     ],
@@ -178,8 +193,19 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
 def test_what_cannot_be_done_is_said(
     model: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    words = [word.replace("model.json", str(model)) for word in words]
     assert cli.main(["export", str(model), *words, "--out", str(model.parent / "out")]) == 2
     assert message in capsys.readouterr().err
+    assert not list((model.parent / "out").glob("*"))
+
+
+@pytest.mark.parametrize("length", [25, 31])
+def test_a_name_is_that_of_all_files(model: Path, tmp_path: Path, length: int) -> None:
+    name, words = length * "a", ["--format", "c,torchscript", "--out", str(tmp_path / "out")]
+    assert cli.main(["export", str(model), "--name", name, *words]) == 0
+    assert {path.name.partition(".")[0] for path in (tmp_path / "out").iterdir()} == {
+        name, f"{name}_selftest", f"{name}_sfun",
+    }  # fmt: skip
 
 
 def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:

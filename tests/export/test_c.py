@@ -23,7 +23,7 @@ from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.memory import Gear
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
-from nfriction.plant import Rotor, rigs
+from nfriction.plant import LinearAxis, Rotor, rigs
 from tests.export.artefacts import Rising
 from tests.friction.samples import randomise
 
@@ -600,6 +600,18 @@ def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_pat
            "-o", "s.o"], tmp_path)  # fmt: skip
     c(random_model("CVFM", joints), tmp_path / "even", info)
     assert "HAS_LOAD 0" in (tmp_path / "even" / "nfriction.h").read_text()
+
+
+def test_texts_name_continuous_positions_and_those_of_an_axis(tmp_path):
+    texts = {}
+    for unit, plant in (("rad", rigs.multiarm_double()), ("m", LinearAxis(2.0))):
+        info = ModelInfo(unit=unit, rig=plant.to_dict(), sample_time=1e-3)
+        c(random_model("LFM", plant.joints), tmp_path, info, with_filter=True)
+        texts[unit] = [(tmp_path / f"nfriction.{x}").read_text() for x in ("h", "ino", "hpp")]
+        assert "continuous: unwrap" in texts[unit][0]
+        assert "It must be continuous" in texts[unit][1]
+    assert "the first angle from" in texts["rad"][0]
+    assert not any(word in text for text in texts["m"] for word in ("angle", "upright"))
 
 
 def test_the_header_has_the_constant_torques_that_a_fit_gave_to_the_drives(tmp_path):

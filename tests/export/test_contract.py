@@ -3,12 +3,15 @@
 import json
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from nfriction import export, rigs
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -20,6 +23,7 @@ from nfriction.export.controller import NOT_FINITE, controller_of
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import LFM, FrictionModel
 from nfriction.io.model_file import ModelInfo
+from nfriction.signals import Motion
 from tests.export.artefacts import INFO, Rising
 from tests.friction.samples import named_models
 
@@ -210,7 +214,26 @@ def test_hostile_metadata_are_refused(text: str, message: str) -> None:
         Contract.from_json(text)
 
 
-def test_names_must_be_one_a_joint() -> None:
-    model = LFM(2)
-    with pytest.raises(ValueError, match="name 2 joints"):
-        contract_of(model, controller_of(model), ModelInfo(joint_names=["a"]))
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        (ModelInfo(joint_names=["a"]), "name 2 joints"),
+        (
+            ModelInfo(rig=rigs.tlrip().to_dict()),
+            "`rig` has 3 joints, the model 2: give that",
+        ),
+    ],
+)
+def test_names_and_rig_must_have_the_models_joints(
+    info: ModelInfo, message: str, tmp_path: Path
+) -> None:
+    model, motion = LFM(2), Motion(*(np.ones((4, 2)) for _ in range(4)))
+    for write in (
+        lambda: export.c(model, tmp_path, info),  # whose load of the rig would leave its array
+        lambda: export.torchscript(model, tmp_path / "m.pt", info),
+        lambda: export.pt2(model, tmp_path / "m.pt2", info),
+        lambda: export.fit_damping_frictionloss(model, motion, info=info),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write()
+    assert not list(tmp_path.iterdir())

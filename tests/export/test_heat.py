@@ -1,5 +1,6 @@
 """Exports of friction that falls with heat, which is a state of the controller."""
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,29 @@ def test_c_heats_as_the_model_does_and_starts_cold_after_a_reset(tmp_path: Path)
         np.testing.assert_allclose(coefficients[..., -1], heat, rtol=1e-12, atol=1e-15)
         assert not (status & 2).any()
     assert heat[-1].min() > 0.05
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_c_in_single_precision_loses_no_small_step_of_the_heat(tmp_path: Path) -> None:
+    model = copy.deepcopy(MODEL)
+    model.schedule.set_heat(3.0, 1e6, 2e-3)
+    # A hot joint that then creeps: a step of its heat is below half a digit of it in float.
+    qd = np.full((200_000, 2), 2e-4)
+    qd[:10] = 20.0
+    heats = []
+    for dtype in ("float64", "float32"):
+        run = c_runner(export.c(model, tmp_path, INFO, dtype=dtype)[0])
+        heats.append(run(qd, 0.0 * qd, 0.0 * qd + 1.0)[1][..., -1])
+    assert (heats[0][-1] - heats[0][10]).min() > 1e-3
+    np.testing.assert_allclose(heats[1], heats[0], rtol=1e-6)
+
+
+def test_onnx_in_single_precision_that_would_lose_heat_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    model = copy.deepcopy(MODEL)
+    model.schedule.set_heat(3.0, 600.0, 2e-3)
+    with pytest.raises(ValueError, match="time constant of 600 s loses its steps of"):
+        export.onnx(model, tmp_path / "m.onnx", INFO, dtype="float32")
 
 
 @pytest.mark.parametrize(("info", "expected"), [(ModelInfo(sample_time=1e-3), 1e-3), (None, 2e-3)])

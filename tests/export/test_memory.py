@@ -13,6 +13,7 @@ from nfriction.export.c_file import c_runner, find_compiler
 from nfriction.friction.hysteresis import ELEMENTS, LoadSlip, Slip
 from nfriction.friction.memory import Dahl, ElastoPlastic, Gear, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
+from tests.friction.samples import warming_network
 
 F64 = torch.float64
 STEP = 2e-3
@@ -137,6 +138,16 @@ def test_torchscript_steps_with_a_state(name: str, tmp_path: Path) -> None:
         found.append(tau)
     expected = torques(MODELS[name], qd)
     assert float((torch.stack(found) - expected).abs().max() / expected.abs().max()) < 1e-14
+
+
+def test_torchscript_refuses_a_memory_without_a_state(tmp_path: Path) -> None:
+    path, zero = tmp_path / "model.pt", torch.zeros(2, dtype=F64)
+    heated = warming_network()
+    for model, with_filter in ((MODELS["dahl"], False), (MODELS["gear"], True), (heated, False)):
+        module = torch.jit.load(str(export.torchscript(model, path, INFO, with_filter=with_filter)))
+        with pytest.raises(torch.jit.Error, match=r"depends on earlier samples.*module\.step"):
+            module(zero, zero, zero)
+        assert export.verify_artefact(path, model, INFO, points=50).passed
 
 
 def test_a_model_without_sample_time_is_refused(tmp_path: Path) -> None:

@@ -167,5 +167,5 @@ def test_another_graph_is_not_run_and_other_numbers_are_found_out(tmp_path: Path
 def test_a_filter_in_single_precision_is_refused(tmp_path: Path) -> None:
     if importlib.util.find_spec("onnx") is None:
         pytest.skip("the extra onnx is not installed")
-    with pytest.raises(ValueError, match="filter needs"):
+    with pytest.raises(ValueError, match="filter of ONNX needs float64"):
         onnx(LFM(3), tmp_path / "m.onnx", INFO, dtype="float32", with_filter=True)

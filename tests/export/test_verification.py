@@ -3,6 +3,7 @@
 import json
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from nfriction.export import (
     contract_of,
     controller_of,
     onnx,
+    pt2,
     torchscript,
     verify_artefact,
 )
@@ -34,6 +36,13 @@ def test_torchscript_is_its_model(name: str, tmp_path: Path) -> None:
     assert verdict.passed
     assert verdict.vectors.points >= 200
     assert verdict.points.points == 200
+
+
+@pytest.mark.parametrize(("write", "name"), [(torchscript, "m.pt"), (pt2, "m.pt2")])
+def test_a_joint_with_one_torque_limit_is_its_model(write: Any, name: str, tmp_path: Path) -> None:
+    model = LFM(1, [0.1, 0.2])
+    path = write(model, tmp_path / name, torque_limit=0.2)
+    assert verify_artefact(path, model, points=50).passed
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")

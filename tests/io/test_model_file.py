@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from nfriction import LinearAxis, PendulumChain, __version__, rollout, score
+from nfriction import LinearAxis, PendulumChain, __version__, rigs, rollout, score
 from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
@@ -144,8 +144,6 @@ def test_a_loaded_model_is_compiled_by_default_and_trained_on_demand(tmp_path: P
         (None, "does not describe the mechanism"),
         ({}, "no mechanism .*missing keys"),
         ({"kind": ["chain"]}, "no mechanism"),
-        ({"kind": "chain", "mass": [1.0] * 100, "length": [1.0] * 100}, "100 masses"),
-        ({"kind": "chain", "mass": [1.0], "length": [1.0]}, "1 joints, the model 2"),
         ({"kind": "chain", "mass": [1.0, -1.0], "length": [1.0, 1.0]}, "`mass` must be positive"),
         ({"kind": "chain", "mass": "heavy", "length": 3}, "no mechanism"),
         ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "buffers": [1]}, "no mechanism"),
@@ -366,7 +364,11 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     ),
     "no range": (lambda c: c["input_ranges"].update(qd=None), "must be numbers"),
     "names no texts": (lambda c: c.update(joint_names=["a", 2]), "must be texts"),
-    "too few names": (lambda c: c.update(joint_names=["a"]), "must be 2 texts"),
+    "too few names": (lambda c: c.update(joint_names=["a"]), "must name 2 joints"),
+    "rig of another": (
+        lambda c: c.update(rig={"mass": [1.0] * 100, "length": [1.0] * 100}),
+        "`rig` has 100 joints, the model 2: give that of its fit",
+    ),
     "rating no text": (lambda c: c["fit"].update(usability=1), "`usability` must be two texts"),
     "digest no text": (lambda c: c["training_data"].update(run=1), "map names to digests"),
     "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "not an array|got shape"),
@@ -460,6 +462,10 @@ def test_what_cannot_be_told_in_json_is_not_saved(tmp_path: Path) -> None:
         save(model, path, ModelInfo(fit={"residual": torch.ones(())}))
     with pytest.raises(ValueError, match="name 2 joints, got \\['one'\\]"):
         save(model, path, ModelInfo(joint_names=["one"]))
+    with pytest.raises(ValueError, match="name 2 joints, got ab"):
+        save(model, path, ModelInfo(joint_names="ab"))
+    with pytest.raises(ValueError, match="`rig` has 3 joints, the model 2: give that of its fit"):
+        save(model, path, ModelInfo(rig=rigs.tlrip().to_dict()))
     with torch.no_grad():
         model.schedule.raw[0, 0] = torch.nan
     with pytest.raises(ValueError, match=r"`schedule\.raw` is not finite"):

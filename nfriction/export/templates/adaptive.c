@@ -19,7 +19,7 @@ static int nf_above(REAL envelope, const REAL border[2][NF_JOINTS], int j)
 }
 
 /* Memory before the first sample. */
-static void nf_class_start(REAL qd, REAL qdd, REAL *memory, int j)
+static void nf_class_start(REAL qd, REAL qdd, nf_memory *memory, int j)
 {
     const REAL size = real_sqrt(qdd * qdd + NF_SWING_RATE[j] * qd * (NF_SWING_RATE[j] * qd));
     memory[0] = nf_min(size, NF_CEILING[j]);
@@ -27,7 +27,7 @@ static void nf_class_start(REAL qd, REAL qdd, REAL *memory, int j)
 }
 
 /* Memory after one more sample. */
-static void nf_class_advance(REAL qdd, REAL *memory, int j)
+static void nf_class_advance(REAL qdd, nf_memory *memory, int j)
 {
     int known = (int)memory[1], least, most;
     memory[0] = nf_min(nf_max(real_abs(qdd), {{ fading }} * memory[0]), NF_CEILING[j]);

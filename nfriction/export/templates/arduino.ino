@@ -23,7 +23,12 @@ static const nf_real GAIN = (nf_real)0.8;
 // Velocity below which the torque fades out, against chatter near standstill [{{ unit }}/s].
 static const nf_real DEAD_BAND = (nf_real)0.05;
 
+{% if unit == "m" %}
+// Position [m] of an axis; here from an analogue pin. It must be continuous.
+{% else %}
 // Position [{{ unit }}] of a joint, the first from upright, others relative; here from an analogue pin over one turn.
+// It must be continuous: add up the turns of an encoder that wraps, or each jump gives a torque pulse.
+{% endif %}
 static double read_position(int joint)
 {
     return analogRead(A0 + joint) * (6.283185307179586 / 1023.0);

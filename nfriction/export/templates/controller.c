@@ -67,7 +67,7 @@ void nf_step(
     int known[NF_JOINTS];
 {% endif %}
 {% if form == "traced" and state_size %}
-    REAL next[NF_JOINTS * NF_STATE_SIZE];
+    nf_memory next[NF_JOINTS * NF_STATE_SIZE];
 {% endif %}
 {% if form == "traced" and clamped %}
     REAL within[2][NF_JOINTS];

@@ -52,9 +52,10 @@ extern "C" {
 typedef REAL nf_real;
 
 {% if state_size %}
-/* State of the coefficients from earlier samples. */
+/* State of the coefficients from earlier samples{{ ", in double, as float would lose its small steps" if memory != real }}. */
+typedef {{ memory }} nf_memory;
 typedef struct {
-    nf_real memory[NF_JOINTS * NF_STATE_SIZE];
+    nf_memory memory[NF_JOINTS * NF_STATE_SIZE];
 } nf_state;
 
 /* Memory before the first sample, whose motion is given. */
@@ -62,8 +63,12 @@ void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_
 
 {% endif %}
 {% if load %}
+{% if about.unit == "m" %}
+/* Load of each axis, which this law reads, at its position [m] and velocity [m/s]. */
+{% else %}
 /* Load of each joint, which this law reads, at joint positions and velocities: the first angle from
  * upright, each further one relative to the previous link [{{ safe(about.unit) }}]. */
+{% endif %}
 void nf_load(
     const nf_real q[NF_JOINTS], const nf_real qd[NF_JOINTS], nf_real load[NF_JOINTS]);
 
@@ -80,7 +85,8 @@ void nf_step(
 
 {% if filter_size %}
 /* Two causal low-pass filters in series, each of 2 states, and the last position and velocity.
- * Positions are double, because their differences in float would lose precision. */
+ * Positions are double, because their differences in float would lose precision. They must be
+ * continuous: unwrap a single-turn encoder first, as a jump after a turn is taken for motion. */
 typedef struct {
     double memory[NF_JOINTS * NF_FILTER_SIZE];
 } nf_filter;

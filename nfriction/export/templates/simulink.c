@@ -68,7 +68,7 @@ static void mdlOutputs(SimStruct *S, int_T tid)
     int32_T *begun = (int32_T *)ssGetDWork(S, 1);
     nf_state state;
     for (i = 0; i < NF_JOINTS * NF_STATE_SIZE; ++i)
-        state.memory[i] = (nf_real)memory[i];
+        state.memory[i] = (nf_memory)memory[i];
 #endif
     (void)tid;
     for (port = 0; port < 3; ++port) {

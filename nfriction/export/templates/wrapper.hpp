@@ -43,7 +43,7 @@ public:
     }
 
 #if NF_HAS_LOAD
-    // Load of each joint at joint positions, the first from upright, and velocities.
+    // Load of each joint at positions and velocities, see nf_load.
     static Joints load(const Joints &q, const Joints &qd) {
         Joints found{};
         nf_load(q.data(), qd.data(), found.data());
