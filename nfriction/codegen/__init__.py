@@ -16,15 +16,7 @@ from nfriction.codegen.scalar import (
 from nfriction.codegen.staleness import content, fingerprint
 
 __all__ = [
-    "CodegenError",
-    "CompiledFunction",
-    "CompiledRollout",
-    "Incomparable",
-    "RolloutInputs",
-    "SelfCheckFailed",
-    "UnsupportedOperation",
-    "cache_folder",
-    "content",
-    "fingerprint",
+    "CodegenError", "CompiledFunction", "CompiledRollout", "Incomparable", "RolloutInputs",
+    "SelfCheckFailed", "UnsupportedOperation", "cache_folder", "content", "fingerprint",
     "supported_operations",
-]
+]  # fmt: skip

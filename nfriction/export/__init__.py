@@ -16,21 +16,7 @@ from nfriction.export.torch_files import pt2, torchscript
 from nfriction.export.verification import Verdict, verify_artefact
 
 __all__ = [
-    "Contract",
-    "ContractError",
-    "DampingFit",
-    "ExportError",
-    "Parity",
-    "Verdict",
-    "c",
-    "contract_of",
-    "controller_of",
-    "fit_damping_frictionloss",
-    "mjcf",
-    "onnx",
-    "pt2",
-    "torchscript",
-    "urdf",
-    "verify",
-    "verify_artefact",
-]
+    "Contract", "ContractError", "DampingFit", "ExportError", "Parity", "Verdict", "c",
+    "contract_of", "controller_of", "fit_damping_frictionloss", "mjcf", "onnx", "pt2",
+    "torchscript", "urdf", "verify", "verify_artefact",
+]  # fmt: skip
