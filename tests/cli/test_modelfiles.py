@@ -86,7 +86,7 @@ def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
     assert cli.main(["info", model]) == 0
     assert f"rating:        {rating}" in capsys.readouterr().out
     assert cli.main(["export", model, "--format", "c", "--out", str(tmp_path)]) == 0
-    assert f"m.json has the rating {rating!r}" in capsys.readouterr().err
+    assert f"m.json has the rating '{rating}" in capsys.readouterr().err
     assert f"Rating of the fit: {rating}" in (tmp_path / "m.h").read_text()
 
 
