@@ -15,6 +15,7 @@ from nfriction.codegen.scalar import Node, UnsupportedOperation, evaluate, reach
 from nfriction.export.c_dialect import ControllerC, Real, comment, statements
 from nfriction.export.contract import ExportError
 from nfriction.export.controller import FILTER_STATE, UNBOUNDED, Controller, for_single_precision
+from nfriction.friction.heat import Heated
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant
@@ -57,7 +58,7 @@ def source_of(
         "joints": controller.joints,
         "coefficients": controller.coefficient_count,
         "state_size": controller.memory_size,
-        "memory": "double" if hasattr(controller.model.schedule, "cooling_time") else dialect.real,
+        "memory": "double" if isinstance(controller.model.schedule, Heated) else dialect.real,
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
         "loaded": controller.loaded,

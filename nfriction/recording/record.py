@@ -284,8 +284,7 @@ class Recording:
         """
         _check_columns(columns)
         if not hasattr(table, "attrs"):
-            kind = type(table).__name__
-            raise TypeError(f"`table` must be a pandas.DataFrame, got {kind}; convert it first.")
+            raise TypeError(f"`table` must be a pandas.DataFrame, got {type(table).__name__}.")
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
         factors = None if plant is None else plant.motor_factors
