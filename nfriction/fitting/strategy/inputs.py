@@ -328,8 +328,8 @@ def chosen_inputs(
         if widened is None:
             raise StoppedError
         where = _significant(widened, gain.name)
-        if gain.name == "position":
-            where = [j for j in where if j in _recurring(task, start, seeing=widening)]
+        if gain.name == "position" and where:
+            where &= _recurring(task, start, seeing=widening)
         if not (widened.residual < at.residual and where):
             return tuple(chosen), at, seeing
         # As found by the search; the linearisation predicts only the choice.
@@ -338,17 +338,17 @@ def chosen_inputs(
         at, seeing = widened, widening
 
 
-def _significant(found: FitResult, name: str) -> list[int]:
+def _significant(found: FitResult, name: str) -> set[int]:
     """Joints at which the 95 % interval of an input's coefficient does not include zero.
 
     The intervals take into account that residuals are correlated, unlike the evidence.
     """
     own = {f"{INPUTS[name].name} of {joint}": j for j, joint in enumerate(found.plant.joint_names)}
     of_input = (i for i in found.intervals if i.name in own)
-    return [own[i.name] for i in of_input if not i.low <= NOTHING <= i.high]
+    return {own[i.name] for i in of_input if not i.low <= NOTHING <= i.high}
 
 
-def _recurring(task: FitTask, start: FitResult, seeing: FitTask) -> list[int]:
+def _recurring(task: FitTask, start: FitResult, seeing: FitTask) -> set[int]:
     """Joints whose wave over the position is that of `seeing` without any one recording, too.
 
     Else it follows from what happened in one recording: a wave of some length fits any error.
@@ -360,7 +360,7 @@ def _recurring(task: FitTask, start: FitResult, seeing: FitTask) -> list[int]:
         recordings, motions = zip(*rest, strict=True)
         part = replace(task, recordings=recordings, motions=motions)
         same &= with_position_load(part, start, _wave_rates(task)).plant.load_waves == waves
-    return same.nonzero().flatten().tolist()
+    return {*same.nonzero().flatten().tolist()}
 
 
 @dataclass(frozen=True)
