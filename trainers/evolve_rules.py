@@ -8,9 +8,7 @@ figure, with errors on a twin's test recordings, and the rules of each candidate
 `nfriction.papers.controller.load_rules`. `--resume` continues after the last generation.
 """
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 
 import common
 import numpy as np
@@ -24,7 +22,7 @@ from nfriction.papers.controller.evolve import (
     evolve,
     torque_error,
 )
-from nfriction.papers.controller.rules import FORMAT, RuleBase, Variable
+from nfriction.papers.controller.rules import save_rules
 from nfriction.papers.reproduction.procedure import controllers_from_classes
 from nfriction.papers.reproduction.stages import fit_by_class
 from nfriction.papers.reproduction.workspace import Bench
@@ -85,34 +83,13 @@ def train(argv: Sequence[str] | None) -> str:
     for old in given.out.glob("candidate-*.json"):  # of an earlier run, which may have had more
         old.unlink()
     for number, one in enumerate(front, 1):
-        write_rules(one.controller.rule_base, given.out / f"candidate-{number}.json")
+        save_rules(one.controller.rule_base, given.out / f"candidate-{number}.json")
     common.finished(given)
     return (
         f"{table.round(3).to_string()}\n"
         f"wrote {given.out / 'pareto.csv'}, its figure and candidate-1.json to "
         f"candidate-{len(front)}.json"
     )
-
-
-def write_rules(rules: RuleBase, path: Path) -> None:
-    """Write rules in the form of `load_rules`."""
-
-    def described(variables: Sequence[Variable]) -> dict[str, object]:
-        return {
-            v.name: {
-                "unit": v.unit,
-                "universe": v.universe,
-                "sets": {s.name: {"shape": s.shape, "parameters": s.parameters} for s in v.sets},
-            }
-            for v in variables
-        }
-
-    content = {
-        "format": FORMAT, "name": rules.name,
-        "inputs": described(rules.inputs), "outputs": described(rules.outputs),
-        "rules": [{"if": r.given, "then": r.then, "weight": r.weight} for r in rules.rules],
-    }  # fmt: skip
-    path.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _samples(

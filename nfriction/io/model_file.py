@@ -111,13 +111,15 @@ def check_joints(info: ModelInfo, joints: int) -> None:
     names, count = info.joint_names, joints
     if isinstance(names, str) or len(names) not in (0, joints):
         raise ValueError(f"`joint_names` must name {joints} joints, got {shortened(names, 80)}.")
-    masses = (info.rig or {}).get("mass")
+    rig = info.rig or {}
+    masses = rig.get("mass")
     # The matrices of a chain grow with the square of its links.
     if isinstance(masses, list) and len(masses) > joints:
         count = len(masses)
-    with suppress(*_UNFIT), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        count = count if count > joints else from_dict(info.rig or {}).joints
+    else:
+        with suppress(*_UNFIT), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            count = from_dict(rig).joints
     if count != joints:
         raise ValueError(f"`rig` has {count} joints, the model {joints}: give that of its fit.")
 

@@ -20,7 +20,7 @@ import torch
 from nfriction import ANCFM, CVFM, load, rollout, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
-from nfriction.papers.controller import load_rules, paper_controller
+from nfriction.papers.controller import load_rules, paper_controller, save_rules
 from nfriction.papers.nffem import train_network
 from nfriction.papers.nffem.evidence import EvidenceState
 from nfriction.plant import PendulumChain, rigs
@@ -91,7 +91,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def begin(log: Path, *words: object) -> None:
-    """What a trainer does before its fits."""
+    """Read the data and begin checkpoints, as a trainer does before its fits."""
     words = (log, "--rig", log.with_name("rig.json"), "--out", log.parent, *words)
     given = common.parser("").parse_args([*map(str, words)])
     common.start(given, common.read(given))
@@ -304,7 +304,7 @@ def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
 
 def test_written_rules_are_read_back(tmp_path: Path) -> None:
     rules, path = paper_controller(3).rule_base, tmp_path / "rules.json"
-    runpy.run_path(str(TRAINERS / "evolve_rules.py"))["write_rules"](rules, path)
+    save_rules(rules, path)
     assert load_rules(path) == rules
 
 

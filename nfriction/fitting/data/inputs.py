@@ -517,7 +517,7 @@ def _still_joints(
         if extent == 0:
             yield (
                 f"{name} never moves: its friction is not observable. If a brake holds it, use a "
-                "rig in which its link is fixed, as simulations let it move."
+                "rig in which its link is fixed, because simulations let it move."
             )
         elif extent < min_counts * one:
             yield (

@@ -6,9 +6,16 @@ from nfriction.papers.controller.mamdani import (
     controller_surface,
     paper_controller,
 )
-from nfriction.papers.controller.rules import Rule, RuleBase, Variable, load_rules, parse_rules
+from nfriction.papers.controller.rules import (
+    Rule,
+    RuleBase,
+    Variable,
+    load_rules,
+    parse_rules,
+    save_rules,
+)
 
 __all__ = [
     "MamdaniController", "Rule", "RuleBase", "Variable", "controller_surface", "load_fis",
-    "load_rules", "paper_controller", "parse_fis", "parse_rules",
+    "load_rules", "paper_controller", "parse_fis", "parse_rules", "save_rules",
 ]  # fmt: skip

@@ -31,6 +31,7 @@ any number of inputs: `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
 
 from __future__ import annotations
 
+import json
 import math
 import reprlib
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.io.files import numbers, parse_json, shortened
+from nfriction.io.files import numbers, parse_json, shortened, write_atomically
 from nfriction.plant.base import check_keys
 
 FORMAT = "nfriction-rules/1"
@@ -142,6 +143,26 @@ def load_rules(path: str | Path) -> RuleBase:
     """
     path = Path(path)
     return parse_rules(read_text(path), path.name)
+
+
+def save_rules(rules: RuleBase, path: str | Path) -> None:
+    """Write rules as a file that `load_rules` reads."""
+
+    def described(variables: tuple[Variable, ...]) -> dict[str, object]:
+        return {
+            v.name: {
+                "unit": v.unit, "universe": v.universe,
+                "sets": {s.name: {"shape": s.shape, "parameters": s.parameters} for s in v.sets},
+            }
+            for v in variables
+        }  # fmt: skip
+
+    content = {
+        "format": FORMAT, "name": rules.name,
+        "inputs": described(rules.inputs), "outputs": described(rules.outputs),
+        "rules": [{"if": r.given, "then": r.then, "weight": r.weight} for r in rules.rules],
+    }  # fmt: skip
+    write_atomically(path, json.dumps(content, indent=1).encode())
 
 
 def read_text(path: Path) -> str:
