@@ -10,6 +10,7 @@ coefficients themselves for parameters. The next step is `nfriction.friction.mod
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any, ClassVar
 
 import torch
@@ -57,9 +58,9 @@ class Schedule(nn.Module, ABC):
         super().__init__()
         if not isinstance(law, Law):
             raise TypeError(f"`law` must be a Law, such as laws.VISCOUS, got {law!r}.")
-        if not isinstance(joints, int) or joints < 1:
+        if not isinstance(joints, Integral) or joints < 1:
             raise ValueError(f"`joints` must be a whole number of at least 1, got {joints!r}.")
-        self.joints = joints
+        self.joints = int(joints)
         self.coefficient_names = list(law.names)
         self.fitted_mask = [c.fitted for c in law.coefficients]
         self.limits = [
@@ -189,7 +190,7 @@ class Tabulated(Schedule):
         cells: tuple[int, ...] = (),
     ) -> None:  # fmt: skip
         super().__init__(law, joints)
-        shape = (joints, *cells, len(law.names))
+        shape = (self.joints, *cells, len(law.names))
         self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
         if initial is None:
             # Small but not zero: a gradient step on the logarithm of zero would not leave it.

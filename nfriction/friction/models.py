@@ -71,12 +71,14 @@ class FrictionModel(nn.Module):
         """
         if not torch.jit.is_scripting():
             qd, qdd, load = as_tensor("qd", qd), as_tensor("qdd", qdd), as_tensor("load", load)
-        # A single velocity would silently broadcast to all joints' coefficients.
-        width = qd.shape[-1] if qd.ndim else 0
-        if width != self.joints:
-            raise ValueError(
-                f"`qd` must be (*batch, joint) with {self.joints} joints, got last axis {width}."
-            )
+        # Other widths would silently broadcast to all joints' coefficients.
+        for name, given in (("qd", qd), ("qdd", qdd), ("load", load)):
+            width = given.shape[-1] if given.ndim else 0
+            if width != self.joints:
+                raise ValueError(
+                    f"`{name}` must be (*batch, joint) with {self.joints} joints, got last axis "
+                    f"{width}."
+                )
         return self.torque(qd, load, self.schedule(qd, qdd))
 
     # A simulation computes the torque in two steps: the coefficients at a sample, which it holds,

@@ -80,6 +80,10 @@ class ModelInfo:
         if not pair or not all(isinstance(text, str) for text in rated):
             raise ValueError(f"a fit's `usability` must be two texts, got {str(rated)[:80]!r}.")
         for name, given in self.input_ranges.items():
+            if name not in ("qd", "qdd"):
+                raise ValueError(
+                    f'`input_ranges` must be of "qd" and "qdd", got {str(name)[:80]!r}.'
+                )
             pairs = numbers(f"input_ranges[{name!r}]", given)
             sound = isinstance(pairs, list) and all(isinstance(p, list) for p in pairs)
             if not sound or not all(len(p) == 2 and p[0] <= p[1] for p in pairs):

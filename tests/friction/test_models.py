@@ -196,6 +196,10 @@ def test_options_are_those_given() -> None:
 def test_the_number_of_joints_must_fit() -> None:
     with pytest.raises(ValueError, match="3 joints, got last axis 2"):
         LFM(3)(*motion(5, 2))
+    qd, qdd, load = motion(1, 3)
+    with pytest.raises(ValueError, match="`load` must be .* 3 joints, got last axis 1"):
+        LFM(3)(qd, qdd, load.reshape(3, 1))
+    assert LFM(np.int64(3)).schedule.joints == 3
 
 
 @pytest.mark.parametrize("v_smooth", [0.0, -1.0, float("nan"), float("inf")])

@@ -362,6 +362,10 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
         lambda c: c["input_ranges"].update(qd=[[1.0, -1.0]]),
         "lowest, highest",
     ),
+    "range of something else": (
+        lambda c: c["input_ranges"].update(velocity=[[0.0, 1.0]]),
+        '`input_ranges` must be of "qd" and "qdd", got \'velocity\'',
+    ),
     "no range": (lambda c: c["input_ranges"].update(qd=None), "must be numbers"),
     "names no texts": (lambda c: c.update(joint_names=["a", 2]), "must be texts"),
     "too few names": (lambda c: c.update(joint_names=["a"]), "must name 2 joints"),
