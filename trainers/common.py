@@ -8,14 +8,13 @@ import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from matplotlib.ticker import MaxNLocator
 
 from nfriction.cli import console
-from nfriction.cli.inputs import count, positive
+from nfriction.cli.inputs import add_reading_options, count, positive, read_recordings
 from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import score
 from nfriction.export import torchscript
@@ -26,8 +25,6 @@ from nfriction.papers import twin
 from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace, smoothed
 from nfriction.plant import Plant, rigs
 from nfriction.plots import style
-from nfriction.recording import Recording
-from nfriction.recording.angles import AngleConvention
 
 # Options that do not change the result.
 _IRRELEVANT = ("out", "resume")
@@ -53,8 +50,7 @@ def parser(description: str) -> argparse.ArgumentParser:
                       help="the twin to use if no recording is given")  # fmt: skip
     made.add_argument("--seconds", type=positive, help="length of the twin's recordings [s]")
     made.add_argument("--rig", help=f"a rig file, or one of {', '.join(rigs.names())}")
-    made.add_argument("--angles", help="angle convention of the files, e.g. absolute,hanging")
-    made.add_argument("--degrees", action="store_true", help="the files are in degrees")
+    add_reading_options(made)
     made.add_argument("--plant", choices=("fit", "given"), default="given",
                       help="fit: adjust inertia and gravity terms within bounds")  # fmt: skip
     made.add_argument("--windows", type=positive, nargs="+", default=[0.5, 2.0], metavar="SECONDS",
@@ -160,18 +156,7 @@ def read(given: argparse.Namespace) -> Bench:
     if given.rig is None:
         raise ValueError("recordings need --rig, a rig file or the name of one.")
     plant = rigs.of(given.rig)
-    convention = AngleConvention.of(given.angles or plant)
-    unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
-    train = [
-        Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
-        for path in given.recordings
-    ]
-    for path, recording in zip(given.recordings, train, strict=True):
-        if recording.joints != plant.joints:
-            raise ValueError(
-                f"--rig must have the joints of the recordings, got {plant.joints} and "
-                f"{recording.joints} in {path}; give the file of its rig."
-            )
+    train = read_recordings(given.recordings, plant, given)
     return Bench(plant, train, [], smoothed(plant, train), {})
 
 
@@ -247,5 +232,5 @@ def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None
             sys.stdout.flush()  # otherwise a closed pipe fails too late to be caught
     except BrokenPipeError:
         sys.exit(console.drop_output())
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, console.UsageError) as error:
         sys.exit(f"error: {error}")

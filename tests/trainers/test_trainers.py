@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from nfriction import ANCFM, CVFM, load, rollout, save
+from nfriction.cli.console import UsageError
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
 from nfriction.papers.controller import load_rules, paper_controller, save_rules
@@ -128,7 +129,7 @@ def test_checkpoints_are_deleted_only_after_a_finished_run_and_for_good_data(log
         begin(log)
     common.finished(common.parser("").parse_args(["--out", str(log.parent)]))
     for wrong in (["--rig", "no.json"], ["--angles", "x"], ["--rig", "tlrip"]):
-        with pytest.raises((ValueError, OSError)):
+        with pytest.raises((ValueError, OSError, UsageError)):
             begin(log, *wrong)
     with pytest.raises(SystemExit, match="--joint must be 1 to 1, got 2"):
         train("evolve_rules.py", log, "--rig", log.with_name("rig.json"), "--joint", "2",
@@ -141,6 +142,24 @@ def test_checkpoints_are_deleted_only_after_a_finished_run_and_for_good_data(log
 def test_recordings_need_a_rig(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="--rig"):
         train("train_adaptive.py", "run.csv", "--out", tmp_path)
+
+
+def test_columns_of_a_recording_are_named_as_in_fits(tmp_path: Path) -> None:
+    time = np.arange(0.0, 1.0, 2e-3)
+    positions = np.degrees(np.pi + 0.5 * np.cos(8.0 * time))
+    table, rig = tmp_path / "run.csv", tmp_path / "rig.json"
+    np.savetxt(table, np.c_[1e3 * time, positions], delimiter=",", header="t,enc", comments="")
+    rig.write_text('{"mass": [0.2], "length": [0.2]}')
+    options = ["--rig", rig, "--columns", "time=t:ms,q1=enc:deg"]
+    made = common.parser("").parse_args([str(word) for word in (table, *options)])
+    (recording,) = common.read(made).train
+    assert recording.q[:, 0] == pytest.approx(np.radians(positions))
+    assert recording.time[-1] == pytest.approx(time[-1])
+    other = common.parser("").parse_args(
+        [str(word) for word in (table, *options, "--rig", "tlrip")]
+    )
+    with pytest.raises(UsageError, match="has 1 joints, the rig has 3"):
+        common.read(other)
 
 
 @pytest.fixture(scope="module")
