@@ -304,38 +304,39 @@ def chosen_inputs(
     one without encoder offsets. Raises StoppedError if the caller stops a search.
     """
     names, at, longest = candidates(task), start, longest_duration(task.motions)
-    # Load and position exclude each other, as a plant gives only one of them.
-    tasks = {"position": with_position_load(task, start)} if "position" in names else {}
-    if "load" in names or not tasks:
-        tasks["load"] = task
+    placed = with_position_load(task, start) if "position" in names else task
+    # A plant gives only one of them.
+    exclusive = ("load", "position")
     chosen: list[InputGain] = []
     seeing = task
     while True:
         found, held = [], [gain.name for gain in chosen]
-        for kind, one in tasks.items():
-            tried = {n: INPUTS[n].name for n in names if n == kind or n not in ("load", "position")}
+        for kind in [n for n in exclusive if n in names] or ["load"]:
+            tried = {n: INPUTS[n].name for n in names if n == kind or n not in exclusive}
+            one = placed if kind == "position" else task
             choice = _Choice.of(widened_fitter(one, start, [*tried], longest, at), one, at, tried)
             best = choice.best(held, task.options.input_evidence) if choice else None
-            found += [(*best, kind)] if best else []
+            found += [best] if best else []
         if not found:
             return tuple(chosen), at, seeing
-        _, gain, kind = max(found, key=lambda one: one[0])
-        widening = seeing
-        if gain.name == kind:
-            tasks = {kind: tasks[kind]}
-            widening = replace(tasks[kind], plant=seeing_plant(tasks[kind].plant, [kind]))
+        _, gain = max(found, key=lambda one: one[0])
+        widening = placed if gain.name == "position" else seeing
+        widening = replace(widening, plant=seeing_plant(widening.plant, [gain.name]))
         widened = widened_start(widening, start, [*held, gain.name])
         if widened is None:
             raise StoppedError
         where = _significant(widened, gain.name)
         if gain.name == "position" and where:
             where &= _recurring(task, start, seeing=widening)
-        if not (widened.residual < at.residual and where):
-            return tuple(chosen), at, seeing
-        # As found by the search; the linearisation predicts only the choice.
-        share = 1.0 - (widened.residual / at.residual) ** 2
-        chosen.append(replace(gain, share=share))
-        at, seeing = widened, widening
+        if widened.residual < at.residual and where:
+            # As found by the search; the linearisation predicts only the choice.
+            share = 1.0 - (widened.residual / at.residual) ** 2
+            chosen.append(replace(gain, share=share))
+            at, seeing = widened, widening
+            names = tuple(n for n in names if {n, gain.name} != {*exclusive})
+        else:
+            # Another input may explain the same errors.
+            names = tuple(n for n in names if n != gain.name)
 
 
 def _significant(found: FitResult, name: str) -> set[int]:
