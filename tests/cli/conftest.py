@@ -32,10 +32,10 @@ def compared(bench: Path) -> Path:
 @pytest.fixture(scope="session")
 def again(bench: Path) -> tuple[Path, str]:
     """Folder of the same comparison, by plain names and without figures, and what it printed."""
-    out, said = bench / "again", io.StringIO()
-    with contextlib.redirect_stdout(said):
+    out, printed = bench / "again", io.StringIO()
+    with contextlib.redirect_stdout(printed):
         assert compare(bench, out, "--no-figures", models="viscous,load-coulomb") == 0
-    return out, said.getvalue()
+    return out, printed.getvalue()
 
 
 @pytest.fixture

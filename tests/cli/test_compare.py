@@ -78,27 +78,27 @@ def test_equal_input_gives_equal_bytes(compared: Path, again: tuple[Path, str]) 
 
 
 def test_verdict_names_the_winner_and_its_file(again: tuple[Path, str]) -> None:
-    out, said = again
-    assert "models: NCFM: viscous, LFM: load-coulomb\n" in said
-    assert "best on test recordings: LFM" in said
-    (file,) = re.findall(r"its model file: (.*)", said)
+    out, printed = again
+    assert "models: NCFM: viscous, LFM: load-coulomb\n" in printed
+    assert "best on test recordings: LFM" in printed
+    (file,) = re.findall(r"its model file: (.*)", printed)
     assert Path(file).is_file()
     coefficients = results(out)["models"]["LFM"]["coefficients"]
-    told = said.partition("Coefficients of LFM\n")[2]
-    header, row, *_ = told.splitlines()
+    printed_table = printed.partition("Coefficients of LFM\n")[2]
+    header, row, *_ = printed_table.splitlines()
     assert re.split(r"\s{2,}", header.strip()) == ["B [N m s/rad]", "C [N m]"]
     values = [float(word) for word in row.split()[1:]]
     # Four digits are printed.
     assert values == pytest.approx([coefficients["B"][0], coefficients["C"][0]], rel=1e-3)
-    assert "windows of 5 s: none, b lasts 1.2 s" in said
-    assert f"\nresults and models are in {out}\n" in said
+    assert "windows of 5 s: none, b lasts 1.2 s" in printed
+    assert f"\nresults and models are in {out}\n" in printed
 
 
 def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
     again: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, said = again
-    *_, without, learnt, report, export = said.splitlines()
+    out, printed = again
+    *_, without, learnt, report, export = printed.splitlines()
     free = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(out)["models"].items()}
     none, best = free["no friction"], free["LFM"]
     assert without.endswith(f" miss the measured motion by {1e3 * none:.3g} mrad;")
@@ -152,32 +152,32 @@ def test_the_choice_on_training_data_is_told_with_its_reason(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(bench, bench / "chosen", "--select", "--no-figures", models="NCFM,LFM") == 0
-    told = capsys.readouterr().out.partition("training data alone would choose ")[2]
-    chosen, reason = told.split("\n")[0].split(": ")
+    choice = capsys.readouterr().out.partition("training data alone would choose ")[2]
+    chosen, reason = choice.split("\n")[0].split(": ")
     assert chosen in ("NCFM", "LFM")
     assert results(bench / "chosen")["selection"]["chosen"] == chosen
     assert "error on hold-out blocks" in reason
     # 0.4 s were left out each time, the first half of which is the lead-in.
-    assert re.search(r"0\.2\d* s simulations", told)
+    assert re.search(r"0\.2\d* s simulations", choice)
     for name in ("NCFM", "LFM"):
-        assert re.search(rf"^{name} +[\d.]+ +\d +(yes|no)$", told, re.MULTILINE)
+        assert re.search(rf"^{name} +[\d.]+ +\d +(yes|no)$", choice, re.MULTILINE)
 
 
 def test_warnings_and_intervals_of_fits_are_told(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(bench, bench / "wary", "--no-figures", models="NCFM,LFM") == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     found = results(bench / "wary")
     fits, best = found["models"], found["best"]["model"]
     for name in ("NCFM", "LFM"):
         for warning in fits[name]["fit"]["warnings"]:
-            assert f"\n  - {warning}" in said
-    table = said.partition("95 % confidence intervals")[2]
+            assert f"\n  - {warning}" in printed
+    table = printed.partition("95 % confidence intervals")[2]
     for name, (low, high) in fits[best]["fit"]["intervals"].items():
         (row,) = (line for line in table.splitlines() if line.startswith(f"{name} "))
-        told = [None if word == "unknown" else float(word) for word in row.split()[-2:]]
-        assert told == [pytest.approx(x, rel=1e-3) for x in (low, high)]
+        interval = [None if word == "unknown" else float(word) for word in row.split()[-2:]]
+        assert interval == [pytest.approx(x, rel=1e-3) for x in (low, high)]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a file name")
@@ -199,11 +199,11 @@ def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Pat
 def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = []
+    stages = []
     step = Progress.step
 
     def interrupted_step(self: Progress, stage: str) -> None:
-        told.append(stage)
+        stages.append(stage)
         signal.raise_signal(signal.SIGINT)
         step(self, stage)
 
@@ -211,7 +211,7 @@ def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     out = bench / "interrupted"
     before = signal.getsignal(signal.SIGINT)
     assert compare(bench, out, models="NCFM,LFM") == 130
-    assert len(told) == 1  # the second model was never begun
+    assert len(stages) == 1  # the second model was never begun
     assert "interrupted (fit NCFM)" in capsys.readouterr().err
     assert not list(out.iterdir())
     assert signal.getsignal(signal.SIGINT) is before
@@ -264,8 +264,8 @@ def test_the_log_tells_what_was_done_and_the_console_no_more(
     lines = log.read_text().splitlines()
     # The second run is told below the first.
     assert sum("nfriction compare" in line for line in lines) == 2
-    for told in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on test recordings: NCFM"):
-        assert sum(line.split("INFO ")[1].startswith(told) for line in lines) >= 2
+    for entry in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on test recordings: NCFM"):
+        assert sum(line.split("INFO ")[1].startswith(entry) for line in lines) >= 2
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING) ", x) for x in lines)
     assert "INFO" not in capsys.readouterr().err
     assert not logging.getLogger("nfriction").handlers

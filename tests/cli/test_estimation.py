@@ -32,7 +32,7 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     assert f"(default: {','.join(f'{w:g}' for w in DEFAULTS.windows)})" in " ".join(
         parser.format_help().split()
     )
-    told = parser.parse_args(
+    given = parser.parse_args(
         [
             "--rig",
             "tlrip",
@@ -43,14 +43,14 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
             "per_recording",
         ]
     )
-    settings = inputs.fit_settings(told)
+    settings = inputs.fit_settings(given)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
     assert settings["encoder_reference"] == "per_recording"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("absent.csv", None, "check the path"),
         ("empty.csv", b"", "is empty"),
@@ -65,13 +65,13 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
 )  # fmt: skip
 @pytest.mark.parametrize("as_test", [False, True])
 def test_files_that_are_no_recordings(
-    bench: Path, failing, name: str, content: bytes | None, said: str, as_test: bool
+    bench: Path, failing, name: str, content: bytes | None, message: str, as_test: bool
 ) -> None:
     if content is not None:
         (bench / name).write_bytes(content)
     files = [bench / "a.csv.gz", "--test", bench / name] if as_test else [bench / name]
     line = failing("compare", *files, "--rig", bench / "bench.json", "--out", bench / "bad")
-    assert said in line
+    assert message in line
     assert name in line
 
 
@@ -153,7 +153,7 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "message"),
     [
         ("time,q1,q2,tau2", "no column tau1, so that joint is assumed to be passive; if "
          "it is driven, name it with --columns tau1=NAME."),
@@ -162,7 +162,7 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
     ],
 )  # fmt: skip
 def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str, said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str, message: str
 ) -> None:
     rows = "".join(f"{0.01 * k},0.1,0.2,0.3\n" for k in range(9))
     paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
@@ -173,7 +173,7 @@ def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
     arguments = parser.parse_args(["--rig", "multiarm-double"])
     with warnings.catch_warnings():
         inputs.read_recordings(paths, inputs.read_rig("multiarm-double"), arguments)
-    assert capsys.readouterr().err == f"nfriction: warning: a, b: {said}\n"
+    assert capsys.readouterr().err == f"nfriction: warning: a, b: {message}\n"
 
 
 def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Path) -> None:
@@ -238,7 +238,7 @@ def test_a_law_of_ones_own_goes_all_the_way(
 
 
 @pytest.mark.parametrize(
-    ("law", "said"),
+    ("law", "message"),
     [
         ("my.py:STICKI", "has no law STICKI; its laws: STICKY"),
         ("my.py:OTHER", "has no law OTHER"),
@@ -248,12 +248,12 @@ def test_a_law_of_ones_own_goes_all_the_way(
     ],
 )
 def test_a_law_that_cannot_be_used_is_named(
-    law: str, said: str, own_law: Path, failing: Callable[..., str]
+    law: str, message: str, own_law: Path, failing: Callable[..., str]
 ) -> None:
     (own_law.parent / "broken.py").write_text("STICKY = lw\n")
     words = ("a.csv", "--rig", "tlrip", "--model", own_law.parent / law)
     (own_law.parent / "a.csv").touch()
-    assert said in failing("fit", own_law.parent / "a.csv", *words[1:])
+    assert message in failing("fit", own_law.parent / "a.csv", *words[1:])
 
 
 def test_a_model_file_of_an_unknown_law_says_how_to_name_it(
@@ -303,16 +303,16 @@ def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
         (), torch.zeros(0),
         intervals=tuple(Interval(n, 0.0, -0.1, 0.1) for n in ("F_c of joint1", *changes)),
     )  # fmt: skip
-    said = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
+    terms = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
     assert "complete" not in interval_table(fit)
     doubted = replace(fit, warnings=("The intervals do not cover this.",))
     assert "of CVFM, assuming a complete model (plant" in interval_table(doubted)
     inertia, moment = float(plant.inertia_coupling[1, 1]), float(plant.gravity_moment[1])
-    assert said == [
+    assert terms == [
         "F_c of joint1",
         f"inertia 22 ({inertia:.4g} -> {inertia:.4g} kg m^2)",
         f"gravity 2 ({moment:.4g} -> {moment:.4g} N m)",
         "armature 2 (0.02 -> 0.025 kg m^2)",
         "length 1",
     ]
-    assert fit.to_dict()["names_with_si"]["armature 2"] == said[3]
+    assert fit.to_dict()["names_with_si"]["armature 2"] == terms[3]

@@ -42,20 +42,20 @@ def test_to_controllers_and_back(
     limits = ",".join(["3"] * RIG.joints)
     words = ["--format", "torchscript,c", "--out", str(out), "--torque-limit", limits]
     assert cli.main(["export", str(model), *words]) == 0
-    said = capsys.readouterr().out
-    assert str(out / "lfm.pt") in said
+    printed = capsys.readouterr().out
+    assert str(out / "lfm.pt") in printed
     artefacts = [out / "lfm.pt", *([out / "lfm.c"] if find_compiler() else [])]
     for artefact in artefacts:
         assert run_verify(artefact, model, "--points", 300) == 0
-        said = capsys.readouterr().out
-        assert "drawn points" in said
-        assert f"{artefact.name} is lfm.json" in said
+        printed = capsys.readouterr().out
+        assert "drawn points" in printed
+        assert f"{artefact.name} is lfm.json" in printed
     # Not the TorchScript file, which a process of its own runs, if there is a C compiler.
     other = save(LFM(RIG.joints, [1.0, 1.0]), tmp_path / "other.json")
     assert run_verify(artefacts[-1], other) == 1
-    said = capsys.readouterr().out
-    assert "DIFFERENT" in said
-    assert f"{artefacts[-1].name} IS NOT other.json" in said
+    printed = capsys.readouterr().out
+    assert "DIFFERENT" in printed
+    assert f"{artefacts[-1].name} IS NOT other.json" in printed
 
 
 def test_the_papers_network_is_also_written_to_learn_online(
@@ -130,8 +130,8 @@ def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     recording.write(tmp_path / "run.csv")
     words = ["--format", "mjcf,urdf", "--recording", str(tmp_path / "run.csv")]
     assert cli.main(["export", str(model), *words, "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert said.count("RMS") == 2 * RIG.joints
+    printed = capsys.readouterr().out
+    assert printed.count("RMS") == 2 * RIG.joints
     for name in ("lfm.xml", "lfm.urdf"):
         assert RIG.joint_names[0] in (tmp_path / name).read_text()
 
@@ -211,8 +211,8 @@ def test_a_name_is_that_of_all_files(model: Path, tmp_path: Path, length: int) -
 def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
     words = ["--with-filter", "--cutoff", "30", "--format", "c", "--out", str(tmp_path / "out")]
     assert cli.main(["export", str(model), *words]) == 0
-    told = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
-    assert told["filter"]["cutoff_hz"] == 30.0
+    contract = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
+    assert contract["filter"]["cutoff_hz"] == 30.0
 
 
 @pytest.mark.parametrize("suffix", [".c", ".pt"])

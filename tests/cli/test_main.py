@@ -59,10 +59,12 @@ def test_help_explains_every_option_and_ends_with_an_example(name: str) -> None:
     assert example(parser)[:2] == ["nfriction", name]
     for action in parser._actions:
         if action.option_strings and action.default not in (None, False, [], "==SUPPRESS=="):
-            told = parser._get_formatter()._expand_help(action)
+            help_text = parser._get_formatter()._expand_help(action)
             in_words = "(default: " in action.help
-            assert told.count("(default: ") == 1, f"{name} {action.dest} gives its default twice"
-            assert in_words or f"(default: {action.default})" in told
+            assert help_text.count("(default: ") == 1, (
+                f"{name} {action.dest} gives its default twice"
+            )
+            assert in_words or f"(default: {action.default})" in help_text
 
 
 @pytest.mark.parametrize("name", list(commands()))
@@ -112,8 +114,8 @@ def test_installed_command_fails_in_one_line() -> None:
 
 
 def test_advice_for_python_becomes_that_for_the_command_line() -> None:
-    told = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
-    assert one_line(told) == "torques are late (--fit-delay). Corrected"
+    advice = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
+    assert one_line(advice) == "torques are late (--fit-delay). Corrected"
     assert one_line('not: `encoder_reference="shared"`') == "not: --encoder-reference shared"
     assert one_line("`columns` or `degrees=True`") == "--columns or --degrees"
 
@@ -125,7 +127,7 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (["--windows", "0"], "--windows: must be positive"),
         (["--windows=-1"], "--windows: must be positive"),
@@ -144,9 +146,9 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
         (["--initial-states", "absent.csv"], "absent.csv"),
     ],
 )
-def test_options_that_make_no_sense(bench: Path, failing, more: list[str], said: str) -> None:
+def test_options_that_make_no_sense(bench: Path, failing, more: list[str], message: str) -> None:
     words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--out", bench / "bad"]
-    assert said in failing(*words, *more)
+    assert message in failing(*words, *more)
     assert not (bench / "bad").exists()
 
 

@@ -63,9 +63,9 @@ def test_it_tells_in_a_few_lines_who_is_best(comparison):
     for row, (name, errors) in zip(rows[2:], table.iterrows(), strict=True):
         assert row.startswith(name)
         assert float(row.split()[-1]) == pytest.approx(1e3 * errors["all"], rel=1e-3)
-    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, test={}))
-    assert "training recordings, best: None" in told
-    assert told.endswith("not fitted: ALFM: no classes")
+    text = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, test={}))
+    assert "training recordings, best: None" in text
+    assert text.endswith("not fitted: ALFM: no classes")
 
 
 def test_fits_are_found_by_plain_names_and_a_notebook_shows_them(comparison):
@@ -203,8 +203,10 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
         cut = slice(0, -100) if name == "train" else slice(100, None)
         recordings.append(dataclasses.replace(made, tau=tau, name=name)[cut])
     compare(axis, "CVFM", *recordings, horizons=(0.5,), windows=(0.5,), fit_plant=False)
-    said = [str(w.message) for w in recwarn if "differs from the training" in str(w.message)]
-    assert [bool(re.search(text, sentence)) for sentence in said] == [True] * bool(text), said
+    messages = [str(w.message) for w in recwarn if "differs from the training" in str(w.message)]
+    assert [bool(re.search(text, sentence)) for sentence in messages] == [True] * bool(text), (
+        messages
+    )
 
 
 @pytest.mark.parametrize(
@@ -233,8 +235,10 @@ def test_a_free_test_recording_that_differs_is_named(recwarn, change, text):
         q = made.q + np.array([0.0, own.get("zero", 0.0)])
         recordings.append(dataclasses.replace(made, q=q, name=name))
     compare(rig, "CVFM", *recordings, horizons=(1.0,), windows=(0.5,), drag=False)
-    said = [str(w.message) for w in recwarn if str(w.message).startswith("free: ")]
-    assert [bool(re.search(text, sentence)) for sentence in said] == [True] * bool(text), said
+    messages = [str(w.message) for w in recwarn if str(w.message).startswith("free: ")]
+    assert [bool(re.search(text, sentence)) for sentence in messages] == [True] * bool(text), (
+        messages
+    )
 
 
 def test_a_piece_of_a_training_recording_is_no_test():

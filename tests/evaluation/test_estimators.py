@@ -131,13 +131,13 @@ def test_tables_serve_as_recordings(fitted: FrictionEstimator, recordings: list[
 
 
 def test_a_table_that_says_no_unit_is_in_the_plant_s() -> None:
-    axis, said = LinearAxis(2.0), "table 1 is in rad, the plant's joints are in m"
+    axis, message = LinearAxis(2.0), "table 1 is in rad, the plant's joints are in m"
     table = driven_axis(axis, LFM(1, [[3.0, 2.0]])).to_pandas()
     plain = pd.DataFrame(table.to_numpy(), columns=table.columns)
     found = FrictionEstimator(axis, "LFM", **QUICK).fit(plain)
     assert found.simulate(plain).shape == (len(plain), 2)
     table.attrs["unit"] = "rad"
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         FrictionEstimator(axis, "LFM", **QUICK).fit(table)
 
 
@@ -156,8 +156,8 @@ def test_parameters_are_kept_as_given_and_told() -> None:
     assert estimator.get_params()["plant"] is plant
     assert estimator.get_params()["windows"] is windows
     assert estimator.set_params(model="CFM", drag=True) is estimator
-    for said in ("drag=True", "model='CFM'", "windows=[0.5]", "rig"):
-        assert said in repr(estimator)
+    for argument in ("drag=True", "model='CFM'", "windows=[0.5]", "rig"):
+        assert argument in repr(estimator)
     assert "max_steps" not in repr(estimator)
     with pytest.raises(ValueError, match="Invalid parameter 'law'"):
         estimator.set_params(law="LFM")

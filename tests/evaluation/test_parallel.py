@@ -59,17 +59,17 @@ def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
 
 
 def test_the_caller_is_told_what_is_done(jobs: int) -> None:
-    told: list[str] = []
+    stages: list[str] = []
     progress = parallel.Progress()
-    progress.stage = told.append  # type: ignore[method-assign]
+    progress.stage = stages.append  # type: ignore[method-assign]
     pieces = {"a": (1.0,), "b": (2.0,)}
     list(parallel.as_completed(whereabouts, pieces, jobs=jobs, progress=progress))
     if jobs == 1:
-        assert told == ["a", "b"]
+        assert stages == ["a", "b"]
     else:
-        assert told[0] == "a | b"
-        assert {line.split()[0] for line in told[1:]} == {"a", "b"}
-        assert told[-1].endswith("done, 0 of 2 left")
+        assert stages[0] == "a | b"
+        assert {line.split()[0] for line in stages[1:]} == {"a", "b"}
+        assert stages[-1].endswith("done, 0 of 2 left")
 
 
 def test_logs_and_warnings_reach_this_process(jobs: int, caplog: pytest.LogCaptureFixture) -> None:
@@ -158,9 +158,9 @@ def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
         time.sleep(0.1)
     time.sleep(1.0)  # the workers start
     os.killpg(process.pid, signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
+    messages = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert said.startswith("nfriction: warning: interrupted: the finished fits are scored")
+    assert messages.startswith("nfriction: warning: interrupted: the finished fits are scored")
     # The model that was finished is not lost.
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [*results["models"]] == ["no friction", "NCFM"]

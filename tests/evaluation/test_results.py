@@ -65,9 +65,9 @@ def test_divergence_is_null_and_stops_no_other_model(
 def test_no_digest_is_lost_where_names_repeat_or_lack(recording: Recording) -> None:
     others = [dataclasses.replace(recording, q=recording.q + k, name=name)
               for k, name in enumerate(("r", "", "", "s"), 1)]  # fmt: skip
-    told = results.digests([recording, *others])
-    assert list(told) == ["r (1)", "r (2)", "recording (3)", "recording (4)", "s"]
-    assert list(told.values()) == [r.digest() for r in (recording, *others)]
+    digests = results.digests([recording, *others])
+    assert list(digests) == ["r (1)", "r (2)", "recording (3)", "recording (4)", "s"]
+    assert list(digests.values()) == [r.digest() for r in (recording, *others)]
     assert set(results.digests([recording])) == {"r"}
 
 
@@ -79,12 +79,14 @@ def test_input_ranges_are_those_of_the_motion(comparison: Comparison, recording:
     assert info.training_data == {"r": recording.digest()}
 
 
-@pytest.mark.parametrize(("factors", "told"), [((1.0, 1.01, 0.99), 2e-3), ((1.0, 2.0), None)])
+@pytest.mark.parametrize(("factors", "expected"), [((1.0, 1.01, 0.99), 2e-3), ((1.0, 2.0), None)])
 def test_one_sample_time_is_told_where_recordings_share_it(
-    comparison: Comparison, recording: Recording, factors: tuple[float, ...], told: float | None
+    comparison: Comparison, recording: Recording, factors: tuple[float, ...], expected: float | None
 ) -> None:
     several = [dataclasses.replace(recording, time=f * recording.time) for f in factors]
-    assert results.model_info(comparison.fits["good"], several).sample_time == pytest.approx(told)
+    assert results.model_info(comparison.fits["good"], several).sample_time == pytest.approx(
+        expected
+    )
 
 
 def test_a_failed_export_is_told_and_leaves_no_older_script(

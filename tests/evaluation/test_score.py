@@ -54,13 +54,13 @@ def test_the_true_model_is_as_good_as_the_encoder(convention):
 @pytest.mark.filterwarnings("ignore:.*has gaps")
 def test_a_score_is_printed_in_a_line():
     errors = Errors(RMSE((0.0, 0.02), 0.0141421), {"1": RMSE((0.0, 0.01), 0.0070711)})
-    told = "free run: 0.0141, 1 s: 0.00707"
-    assert str(errors) == told
+    values = "free run: 0.0141, 1 s: 0.00707"
+    assert str(errors) == values
     scored = Score(
         errors.free_run, errors.windows, errors, "run3", np.zeros(1), np.zeros(1), np.inf
     )
-    assert str(scored) == f"RMSE [rad; m] of run3: {told}; limit of these data: {told}"
-    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {told}"
+    assert str(scored) == f"RMSE [rad; m] of run3: {values}; limit of these data: {values}"
+    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {values}"
 
 
 def test_simulations_start_anew_behind_a_gap():
@@ -77,17 +77,17 @@ def test_simulations_start_anew_behind_a_gap():
 def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
     """An encoder log that says nothing, on a rig that writes absolute angles from hanging."""
     hanging = pendulum(convention=("absolute", "hanging"), position_quantum=QUANTUM)
-    said = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
-    unsaid = replace(said, convention=None)
-    q0 = said.convention.position_from_joint(np.array([1.6, 0.8]))
+    stated = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
+    unstated = replace(stated, convention=None)
+    q0 = stated.convention.position_from_joint(np.array([1.6, 0.8]))
     start = {"initial_state": (q0, np.zeros(2)), "horizons": (0.5,)}
-    found = [score(hanging, MODEL, r, **start) for r in (said, unsaid)]
+    found = [score(hanging, MODEL, r, **start) for r in (stated, unstated)]
     assert found[0].free_run == found[1].free_run
     assert found[0].windows == found[1].windows
     assert found[1].free_run.all < QUANTUM
     # What a recording says counts, whatever the plant says.
-    assert score(plant(), MODEL, said, **start).free_run == found[0].free_run
-    assert score(plant(), MODEL, unsaid, **start).free_run.all > 0.1
+    assert score(plant(), MODEL, stated, **start).free_run == found[0].free_run
+    assert score(plant(), MODEL, unstated, **start).free_run.all > 0.1
 
 
 def test_metres_are_not_scored_as_angles():
@@ -101,7 +101,7 @@ def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
     nan = LFM(2, [1e-3, 1e-3], v_smooth=0.05)
     with torch.no_grad():
         nan.schedule.raw[0, 0] = torch.nan
-    for model, told in (
+    for model, message in (
         (LFM(2, [1e-3, 1e3], v_smooth=1e-3), r"swing: friction needs \d+ integration steps"),
         (nan, "no finite slope"),
     ):
@@ -112,7 +112,7 @@ def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
         assert found.diverged_at == 0.0
         assert found.simulated.shape == recording.q.shape
         assert json.dumps(found.to_dict(), allow_nan=False)
-        assert re.search(told, caplog.text)
+        assert re.search(message, caplog.text)
 
 
 @pytest.mark.parametrize(

@@ -284,10 +284,12 @@ def test_two_controllers_live_in_one_program(tmp_path):
             build([*C89, "-c", f"{name.lower()}.c"], tmp_path)
         objects = [f"{name.lower()}.o" for name in names]
         build([*command, main.name, *objects, "-o", "all", "-lm"], tmp_path)
-        said = subprocess.run([tmp_path / "all"], capture_output=True, text=True, check=True).stdout
+        output = subprocess.run(
+            [tmp_path / "all"], capture_output=True, text=True, check=True
+        ).stdout
         one = torch.ones(3, dtype=torch.float64)
         expected = [random_model(name)(one, one, one)[2].item() for name in names]
-        np.testing.assert_allclose([float(x) for x in said.split()], expected, rtol=1e-13)
+        np.testing.assert_allclose([float(x) for x in output.split()], expected, rtol=1e-13)
 
 
 def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
@@ -310,8 +312,10 @@ def test_the_sketch_starts_at_rest_wherever_the_joints_are(tmp_path, with_filter
     )
     build(["gcc", "-c", "nfriction.c"], tmp_path)
     build([*CXX, f"-I{STUBS}", "main.cpp", "nfriction.o", "-o", "sketch"], tmp_path)
-    said = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["128"] * 6
+    output = subprocess.run(
+        [tmp_path / "sketch"], capture_output=True, text=True, check=True
+    ).stdout
+    assert output.split() == ["128"] * 6
 
 
 @pytest.mark.parametrize(("law", "period"), [("LFM", "INHERITED_SAMPLE_TIME"), ("LuGre", "0.004")])
@@ -590,8 +594,8 @@ def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_pat
     )
     build([*C89, "-c", "nfriction.c"], tmp_path)
     build([*CXX, "-Wno-missing-braces", "main.cpp", "nfriction.o", "-o", "load"], tmp_path)
-    said = subprocess.run([tmp_path / "load"], capture_output=True, text=True, check=True).stdout
-    found = np.array([float(x) for x in said.split()]).reshape(-1, joints)
+    output = subprocess.run([tmp_path / "load"], capture_output=True, text=True, check=True).stdout
+    found = np.array([float(x) for x in output.split()]).reshape(-1, joints)
     tolerance = 1e-14 if dtype == "float64" else 2e-6
     expected = plant.load(q, qd).numpy()
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)

@@ -76,13 +76,13 @@ def test_json_gives_the_same_back_and_the_same_model_the_same_bytes(name: str) -
 def test_it_says_what_a_host_needs() -> None:
     info = ModelInfo(joint_names=["a", "b", "c"], sample_time=2e-3, training_data={"run": "ab12"})
     controller = controller_of(MODELS["LFM"], info, torque_limit=2.0)
-    told = json.loads(contract_of(MODELS["LFM"], controller, info).to_json())
-    assert told["joint_names"] == ["a", "b", "c"]
-    assert told["units"]["tau_f"] == "N m"
-    assert told["sample_time"] == 2e-3
-    assert told["training_data"] == {"run": "ab12"}
-    assert told["torque_limit"] == [2.0, 2.0, 2.0]
-    assert told["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
+    contract = json.loads(contract_of(MODELS["LFM"], controller, info).to_json())
+    assert contract["joint_names"] == ["a", "b", "c"]
+    assert contract["units"]["tau_f"] == "N m"
+    assert contract["sample_time"] == 2e-3
+    assert contract["training_data"] == {"run": "ab12"}
+    assert contract["torque_limit"] == [2.0, 2.0, 2.0]
+    assert contract["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
     assert {
         "version",
         "schema",
@@ -91,7 +91,7 @@ def test_it_says_what_a_host_needs() -> None:
         "edges",
         "tolerance",
         "scales",
-    } <= told.keys()
+    } <= contract.keys()
 
 
 def broken_torque(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:

@@ -165,8 +165,8 @@ def test_what_is_no_artefact_is_refused(
 def test_artefacts_say_nothing_of_the_machine_that_wrote_them(
     kind: str, artefacts: dict[str, Path]
 ) -> None:
-    told = b"".join(x for n, x in files_of(artefacts[kind]).items() if "debug_pkl" not in n)
-    assert str(Path(__file__).parents[2]).encode() not in told
+    content = b"".join(x for n, x in files_of(artefacts[kind]).items() if "debug_pkl" not in n)
+    assert str(Path(__file__).parents[2]).encode() not in content
 
 
 class Saving(nn.Module):

@@ -115,12 +115,12 @@ def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
     found = torch.load(tmp_path / "outputs", weights_only=True)
     expected = model(*inputs).detach()
     assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
-    told = json.loads(run.stdout)
-    assert told["joint_names"] == ["a", "b", "c"]
-    assert told["sample_time"] == 1e-3
-    assert told["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
-    assert told["units"]["tau_f"] == "N m"
-    assert told["parameter_hash"] == parameter_hash(model.state_dict())
+    contract = json.loads(run.stdout)
+    assert contract["joint_names"] == ["a", "b", "c"]
+    assert contract["sample_time"] == 1e-3
+    assert contract["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
+    assert contract["units"]["tau_f"] == "N m"
+    assert contract["parameter_hash"] == parameter_hash(model.state_dict())
     assert METADATA == "nfriction.json"  # others read it by this name
 
 

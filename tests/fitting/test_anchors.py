@@ -153,15 +153,15 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     def openness(uncertainty: CoefficientUncertainty) -> torch.Tensor:
         return (uncertainty.sd(held.qd, held.qdd) / model.schedule.scale)[where]
 
-    told = openness(result_from_shooting(model, p, result, ()).uncertainty)
+    openness_of_fit = openness(result_from_shooting(model, p, result, ()).uncertainty)
     alone = result_from_shooting(model, problem(model, None), result, ())
-    torch.testing.assert_close(told, openness(alone.uncertainty))
+    torch.testing.assert_close(openness_of_fit, openness(alone.uncertainty))
     # As if the data had said what was held.
     known = gathered_information(p, result.x, hac_sd(errors, bandwidth(p.windows.q)))
     known.data[:n, :n] += held.normal_equations(model.schedule)[1]
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
-    assert (told >= (1 - 1e-6) * mistaken).all()
-    assert told.median() > 1.3 * mistaken.median()
+    assert (openness_of_fit >= (1 - 1e-6) * mistaken).all()
+    assert openness_of_fit.median() > 1.3 * mistaken.median()
 
 
 @pytest.mark.parametrize(("prior_sd", "steps"), [(0.03, 20), (0.3, 1)])

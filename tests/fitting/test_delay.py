@@ -121,18 +121,18 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
     fine = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=3.0)
     measured, settings = fine[::10], {"windows": (0.5, 1.5)}
     found = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **settings)
-    (said,) = (text for text in found.warnings if "`fit_delay=True`" in text)
+    (warning,) = (text for text in found.warnings if "`fit_delay=True`" in text)
     # Held over a sample of the simulation, it is early by half of that.
     late = 0.5 * (measured.sample_time - fine.sample_time)
-    (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", said)
+    (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", warning)
     assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
     # Friction depends on the delay, also that of a model which starts from such a fit.
-    assert "F_c of joint1 0.8" in said
+    assert "F_c of joint1 0.8" in warning
     start = {"start": found, "windows": (0.5,), "max_steps": 9}
     by_class = fit(ACVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **start)
-    for told in (found, by_class):
-        assert told.usability[0] == "doubtful"
-        assert "later than" in told.usability[1]
+    for result in (found, by_class):
+        assert result.usability[0] == "doubtful"
+        assert "later than" in result.usability[1]
     held = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), fine, **settings)
     assert not any("delay" in text for text in held.warnings)
 
@@ -152,14 +152,14 @@ def test_a_delay_makes_a_fit_doubtful_where_coefficients_leave_their_intervals(m
         fit(CVFM(2), pendulum(), recording, windows=(0.5,), fit_delay=fitted)
         for fitted in (False, True)
     )
-    said = "".join(text for text in found.warnings if "Perhaps torques" in text)
+    warning = "".join(text for text in found.warnings if "Perhaps torques" in text)
     own = {i.name: (i, x) for i, x in zip(found.intervals[:4], truth, strict=True)}
     assert found.usability[0] == verdict
     assert all(i.low <= x <= i.high for i, x in own.values()) == (verdict == "good")
     # A delay below one sample that no coefficient depends on is not worth a sentence.
-    assert bool(said) == (verdict == "doubtful")
-    named = re.findall(r"(\w+ of joint\d) ([\d.]+)", said)
-    assert bool(named) == bool(said)
+    assert bool(warning) == (verdict == "doubtful")
+    named = re.findall(r"(\w+ of joint\d) ([\d.]+)", warning)
+    assert bool(named) == bool(warning)
     for name, value in named:
         assert float(value.rstrip(".")) == pytest.approx(own[name][1], rel=0.03)
     np.testing.assert_allclose(np.ravel(right.model.schedule.values), truth, rtol=0.03)

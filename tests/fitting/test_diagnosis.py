@@ -171,12 +171,12 @@ def test_a_scale_of_the_torque_that_changes_is_no_change_of_friction(grown, name
         q = q + 1e-5 * rng.normal(size=q.shape)
         recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
-    said = dict(changing_friction(rig, recordings, motions, FitOptions()))
-    assert ("scale" in said) == named
+    warned = dict(changing_friction(rig, recordings, motions, FitOptions()))
+    assert ("scale" in warned) == named
     if named:
         grows = r"scale of the force of joint1 grows by (19|2[01])\.?\d* ± "
-        assert re.search(grows, said.pop("scale"))
-        assert not said
+        assert re.search(grows, warned.pop("scale"))
+        assert not warned
 
 
 @pytest.mark.parametrize("reason", ["too long", "lossy"])
@@ -258,8 +258,8 @@ def geared(play: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("play", "named"), [(1.0, True), (0.0, False)])
 def test_play_in_a_gear_is_named(play, named):
-    said = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
-    shares = [re.search(r"gear of joint1 has play: .* (\d+) ± ", w) for w in said]
+    warned = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
+    shares = [re.search(r"gear of joint1 has play: .* (\d+) ± ", w) for w in warned]
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
 
 
@@ -286,8 +286,8 @@ def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
 
 @pytest.mark.parametrize("change", [0.3, -0.3])
 def test_a_friction_that_changes_within_a_recording_is_named(change):
-    said = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
-    named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in said]
+    warned = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
+    named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in warned]
     ((way, found, within),) = (match.groups() for match in named if match)
     assert way == ("grows" if change > 0 else "falls")
     start, end = 1 - change / 2, 1 + change / 2
@@ -307,9 +307,9 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
     tau += 0.1 * rng.normal(size=q.shape)
     recording = Recording(time[:, 0], q, tau, unit="m")
     motions = [kalman_smoother(recording.time, recording.q)]
-    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
-    assert len(said) == (fall > 0)
-    for changed, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert len(warned) == (fall > 0)
+    for changed, sentence in warned:
         assert changed == "friction"
         found, within = re.search(r"falls by (\S+) ± (\S+) %", sentence).groups()
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
@@ -327,9 +327,9 @@ def test_an_offset_of_a_force_sensor_that_drifts_is_named(drift):
     tau += 0.1 * rng.normal(size=q.shape)
     recording = Recording(time[:, 0], q, tau, unit="m")
     motions = [kalman_smoother(recording.time, recording.q)]
-    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
-    assert [changed for changed, _ in said] == ["offset"] * (drift != 0)
-    for _, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert [changed for changed, _ in warned] == ["offset"] * (drift != 0)
+    for _, sentence in warned:
         way, found, within = re.search(
             r"The offset of the force of joint1 (\w+) by (\S+) ± (\S+) N during", sentence
         ).groups()
@@ -365,9 +365,9 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
         q = q + 1e-5 * rng.normal(size=q.shape)
         recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
-    said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
-    assert len(said) == named
-    for _, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
+    assert len(warned) == named
+    for _, sentence in warned:
         numbers = re.search(r"grows by (\S+) ± (\S+) % in run2 relative to", sentence)
         found, within = map(float, numbers.groups())
         assert abs(found - 30) < within < 5
@@ -377,8 +377,8 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
 @pytest.mark.parametrize("mass", [1.0, 1.1])
 def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp, mass):
     plant = PendulumChain(**MOTOR | {"mass": [mass]})
-    said = warnings_of(plant, *warming(0.0, chirp))
-    assert not any("friction of" in w or "loose" in w for w in said)
+    warned = warnings_of(plant, *warming(0.0, chirp))
+    assert not any("friction of" in w or "loose" in w for w in warned)
 
 
 @pytest.mark.parametrize(
@@ -409,8 +409,8 @@ def test_one_short_motion_is_no_evidence_of_a_change_of_friction(pushed, coeffic
     )  # fmt: skip
     tau = tau + 0.01 * np.random.default_rng(seed).normal(size=tau.shape)
     given = PendulumChain(**MOTOR | {"mass": [mass]})
-    said = warnings_of(given, COUNT * np.round(found.q.numpy() / COUNT), tau)
-    assert not any("friction of" in w for w in said)
+    warned = warnings_of(given, COUNT * np.round(found.q.numpy() / COUNT), tau)
+    assert not any("friction of" in w for w in warned)
 
 
 @pytest.mark.slow
@@ -727,8 +727,8 @@ def test_a_drive_that_is_off_for_a_while_is_named(off):
     assert warnings_of(plant, q, driven) == ()
     (warning,) = warnings_of(plant, q, commanded)
     first = STEP * off.start
-    said = float(re.search(r"the drive of joint1 is off from ([\d.]+) to ", warning)[1])
-    assert said == pytest.approx(first, abs=0.2)
+    lower = float(re.search(r"the drive of joint1 is off from ([\d.]+) to ", warning)[1])
+    assert lower == pytest.approx(first, abs=0.2)
     assert "although a torque is recorded (set it to 0)" in warning
 
 
@@ -882,10 +882,10 @@ def test_friction_that_differs_between_free_swings_is_named_and_of_no_other_rig(
     assert_drift(task.drift, dict.fromkeys(plant.joint_names if factor != 1 else (), factor))
 
 
-def assert_drift(said: tuple[str, ...], factors: dict[str, float]) -> None:
+def assert_drift(warned: tuple[str, ...], factors: dict[str, float]) -> None:
     """The friction of these joints changes by these factors, and of no others."""
-    assert len(said) == len(factors)
-    for sentence, (joint, factor) in zip(said, factors.items(), strict=True):
+    assert len(warned) == len(factors)
+    for sentence, (joint, factor) in zip(warned, factors.items(), strict=True):
         way, found, within = re.match(
             rf"The friction of {joint} (grows|falls) by (\S+) ± (\S+) % "
             "(?:.* to the last|in other)",
@@ -991,9 +991,9 @@ def test_a_scale_of_the_torques_is_named_although_the_rig_errs(scale, inertia, n
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
     wrong = plant.replace(inertia_coupling=plant.inertia_coupling / inertia)
     found = fit(CVFM(1), wrong, recording, windows=(0.5,))
-    said = [w for w in found.warnings if "torques are recorded" in w]
-    assert len(said) == named
-    for text in said:
+    warned = [w for w in found.warnings if "torques are recorded" in w]
+    assert len(warned) == named
+    for text in warned:
         assert re.search(r"are on average 1\.1[78]\d* times those of the rig", text)
         assert found.usability[0] == "doubtful"
 
@@ -1091,9 +1091,9 @@ def test_a_torque_constant_within_its_tolerance_is_named_if_friction_leaves_its_
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(1.0,))
-    told = [warning for warning in found.warnings if "torque constant" in warning]
-    assert len(told) == (scale != 1.0)
-    for warning in told:
+    warned = [warning for warning in found.warnings if "torque constant" in warning]
+    assert len(warned) == (scale != 1.0)
+    for warning in warned:
         assert f"recorded {scale} times as large as they are" in warning
 
 
@@ -1243,9 +1243,9 @@ def test_a_weight_that_the_rig_lacks_takes_no_friction(method, weight):
         values = one.model.schedule.values, expected.schedule.values
         torch.testing.assert_close(*values, rtol=2e-3, atol=0)
         assert float(one.plant.torque_offset) == pytest.approx(-weight, rel=5e-3)
-        (told,) = (w for w in one.warnings if "constant drive force" in w)
-        assert f"add {weight:.2g}"[:6] in told
-        assert "but not if it is a sensor's bias" in told
+        (warning,) = (w for w in one.warnings if "constant drive force" in w)
+        assert f"add {weight:.2g}"[:6] in warning
+        assert "but not if it is a sensor's bias" in warning
 
 
 @pytest.mark.parametrize("seed", [2, 3])

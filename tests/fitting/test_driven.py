@@ -102,10 +102,10 @@ def test_what_gears_lose_is_told_from_dry_friction():
     law = CFM(2, [[0.20], [0.15]], v_smooth=V_SMOOTH)
     recordings = [driven(truth, law, seed) for seed in (0, 1, 2)]
     found = fit(CFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
-    told = {i.name: i for i in found.intervals}
+    intervals = {i.name: i for i in found.intervals}
     for name, loss in (("gear loss 1", 0.05), ("gear loss 2", 0.12)):
-        assert told[name].low < loss < told[name].high, told[name]
-        assert told[name].high - told[name].low < 0.05
+        assert intervals[name].low < loss < intervals[name].high, intervals[name]
+        assert intervals[name].high - intervals[name].low < 0.05
     torch.testing.assert_close(found.model.schedule.values, law.schedule.values, rtol=0.02, atol=0)
 
 
@@ -254,9 +254,9 @@ def test_an_offset_that_the_law_does_not_expect_is_found_where_the_recording_tel
     plant, offset = pendulum(), 4e-4
     truth = NLFM(2, [[offset, 2e-3, 1e-3, 0.0, 1.0]] * 2, v_smooth=V_SMOOTH)
     recording = swing(plant, truth, seconds=1.5)
-    told, denied = (fitted_offset(plant, truth, recording, share) for share in (None, 1e-6))
+    fitted, denied = (fitted_offset(plant, truth, recording, share) for share in (None, 1e-6))
     # A recording counts for many times what the law expects, unless that is next to certainty.
-    assert (told - offset).abs().max() < 0.05 * offset
+    assert (fitted - offset).abs().max() < 0.05 * offset
     assert denied.abs().max() < 0.05 * offset
 
 

@@ -30,17 +30,17 @@ def encoder_terms(found):
 @pytest.mark.slow
 def test_eccentricity_is_found_and_measured():
     found = fit(model(), pendulum(), recorded(3e-3), **SETTINGS)
-    told = encoder_terms(found)
+    terms = encoder_terms(found)
     expected = {
         "encoder cosine 1 [rad]": 3e-3, "encoder sine 1 [rad]": -3e-3,
         "encoder cosine 2 [rad]": -3e-3, "encoder sine 2 [rad]": 1.5e-3,
     }  # fmt: skip
-    assert told.keys() == expected.keys()
+    assert terms.keys() == expected.keys()
     intervals = {i.name: i for i in found.intervals}
     for name, value in expected.items():
         # Twice the half-width: four intervals of 95 % each.
         half = (intervals[name].high - intervals[name].low) / 2
-        assert abs(told[name] - value) < 2 * half + 1e-4
+        assert abs(terms[name] - value) < 2 * half + 1e-4
     # What starts from a fit that found them has them too.
     again = fit(model(), pendulum(), recorded(3e-3), start=found, **SETTINGS)
     assert encoder_terms(again).keys() == expected.keys()

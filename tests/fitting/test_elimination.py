@@ -102,18 +102,18 @@ def test_pieces_do_not_show(piece, monkeypatch):
     torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)
 
 
-def grown(growth, told, seed=0):
+def grown(growth, factor, seed=0):
     """A window whose rows, free of its state, have the triangle `told`; both grow alike.
 
     Returns:
         What its rows tell of what is shared, and what their squares do.
     """
     g = torch.Generator().manual_seed(seed)
-    shared, size = len(told), len(told) + STATE
+    shared, size = len(factor), len(factor) + STATE
     turn = torch.linalg.qr(torch.randn(300, size, generator=g, dtype=F64)).Q
     states, others = growth * torch.randn(2, STATE, size, generator=g, dtype=F64)
     own, free = turn[:, :STATE], turn[:, STATE:]
-    common = own @ others[:, :shared] + free @ told
+    common = own @ others[:, :shared] + free @ factor
     jacobian = torch.cat([common, own @ states[:, :STATE]], 1)
     # Of the states so little that it tells nothing of what is shared.
     precision = torch.full((size,), 1e-12, dtype=F64)
@@ -132,12 +132,12 @@ def triangle(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_told_beside_states_that_grow_is_not_lost(seed):
-    told = triangle(seed)
-    rows, squares = grown(1e12, told, seed)
+    factor = triangle(seed)
+    rows, squares = grown(1e12, factor, seed)
     assert null_directions(NAMES, rows) == ()
     # In units of the diagonal; rows are rounded to 1e-4 where 1e3 was told, by a state of its own.
-    scale = (told.T @ told).diagonal().rsqrt()
-    difference = scale[:, None] * (rows.data - told.T @ told) * scale
+    scale = (factor.T @ factor).diagonal().rsqrt()
+    difference = scale[:, None] * (rows.data - factor.T @ factor) * scale
     assert float(difference.abs().max()) < 1e-3
     # Their squares are rounding of 1e8 where 1e6 was told.
     assert null_directions(NAMES, squares) != ()
@@ -146,12 +146,12 @@ def test_what_is_told_beside_states_that_grow_is_not_lost(seed):
 def test_what_is_not_told_beside_states_that_grow_is_not_claimed():
     wrong = 0
     for seed in range(10):
-        told = triangle(seed)
-        told[:, 1] = 2 * told[:, 0]
-        rows, squares = grown(1e12, told, seed)
+        factor = triangle(seed)
+        factor[:, 1] = 2 * factor[:, 0]
+        rows, squares = grown(1e12, factor, seed)
         (direction,) = null_directions(NAMES, rows)
         assert set(direction.split(" with ")) == {"a", "b"}
-        blind = 0 * told
+        blind = 0 * factor
         blind[:, 1:] = triangle(seed)[:, 1:]
         rows, squares = grown(1e12, blind, seed)
         assert null_directions(NAMES, rows) == ("a",)
@@ -164,8 +164,8 @@ def test_what_is_not_told_beside_states_that_grow_is_not_claimed():
 def test_rounding_of_rows_tells_nothing(growth):
     """Beyond what rows can hold, all is lost; none is claimed for the rounding's sake."""
     rows, _ = grown(growth, triangle(0))
-    told = " with ".join(null_directions(NAMES, rows))
-    assert set(told.split(" with ")) == set(NAMES[:SHARED])
+    directions = " with ".join(null_directions(NAMES, rows))
+    assert set(directions.split(" with ")) == set(NAMES[:SHARED])
 
 
 @pytest.mark.parametrize("growth", [1e16, 4e16, 1e17])
@@ -173,9 +173,9 @@ def test_beside_what_is_lost_no_other_is_told_too_well(growth):
     """At the edge of what rows can hold some are lost, and the others known with these open."""
     kept = too_sure = 0
     for seed in range(60):
-        told = triangle(seed)
-        rows, _ = grown(growth, told, seed)
-        exact = standard_deviations(Information(told.T @ told, torch.zeros(SHARED, dtype=F64)))
+        factor = triangle(seed)
+        rows, _ = grown(growth, factor, seed)
+        exact = standard_deviations(Information(factor.T @ factor, torch.zeros(SHARED, dtype=F64)))
         share = standard_deviations(rows) / exact
         kept += int(share.isfinite().sum())
         too_sure += int((share < 0.9).sum())
@@ -219,7 +219,7 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     fitted = (lower < upper)[:count]
     index = fitted.nonzero().flatten()
     sd = torch.full_like(errors, p.noise_sd)
-    told = gathered_information(p, x, sd).subset(index)
+    gathered = gathered_information(p, x, sd).subset(index)
     squares = by_squares(p, x, sd).subset(index)
     expected = torch.as_tensor(exact)[fitted][:, fitted]
     scale = expected.diagonal().rsqrt()
@@ -227,7 +227,7 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     def error(known: Information) -> float:
         return float((scale[:, None] * (known.data - expected) * scale).abs().max())
 
-    assert error(told) < 1e-3
+    assert error(gathered) < 1e-3
     assert error(squares) > 0.1
 
 

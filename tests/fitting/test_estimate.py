@@ -69,13 +69,13 @@ def test_what_a_wrong_plant_leaves_over_is_told_whether_or_not_the_rig_says_its_
     # A count is that of the encoder's own angle, which is not the joint's here.
     recording = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=2.0)
     wrong = {"mass": [0.3, 0.2], "length": [0.2, 0.15], "inertia": [2e-3, 1e-3]}
-    told = []
+    residual_warnings = []
     for quantum in (None, 2 * np.pi / 8192):
         plant = PendulumChain(**wrong, position_quantum=quantum)
         found = fit(LFM(2), plant, recording, fit_plant=False, windows=(1.0,))
-        told.append([warning for warning in found.warnings if "Residual:" in warning])
-    assert len(told[0]) == 1
-    assert told[0] == told[1]
+        residual_warnings.append([warning for warning in found.warnings if "Residual:" in warning])
+    assert len(residual_warnings[0]) == 1
+    assert residual_warnings[0] == residual_warnings[1]
 
 
 @pytest.mark.slow
@@ -171,11 +171,11 @@ def test_a_joint_that_hardly_moves_is_named_as_lost():
     assert {"B of joint2", "C of joint2"} <= set(
         " with ".join(found.unidentifiable).split(" with ")
     )
-    told = {i.name: i for i in found.intervals}
-    assert told["C of joint2"].high - told["C of joint2"].low > 0.1
+    intervals = {i.name: i for i in found.intervals}
+    assert intervals["C of joint2"].high - intervals["C of joint2"].low > 0.1
     for name, true in (("B of joint1", 1.5e-3), ("C of joint1", 2.5e-3)):
         assert name not in found.unidentifiable
-        assert told[name].value == pytest.approx(true, rel=0.05)
+        assert intervals[name].value == pytest.approx(true, rel=0.05)
 
 
 def test_an_asymmetric_axis_is_told_from_its_offset():
@@ -185,9 +185,9 @@ def test_an_asymmetric_axis_is_told_from_its_offset():
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
     assert float(found.plant.asymmetry) == pytest.approx(0.8, rel=0.1)
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
-    (told,) = (w for w in found.warnings if "times the speed" in w)
-    assert "a drive force of -0." in told
-    assert "larger forwards" in told
+    (warning,) = (w for w in found.warnings if "times the speed" in w)
+    assert "a drive force of -0." in warning
+    assert "larger forwards" in warning
     assert not any("constant drive" in w for w in found.warnings)
 
 
@@ -198,9 +198,9 @@ def test_a_weight_on_an_axis_is_no_asymmetry_of_its_friction():
     recording = replace(level, tau=level.tau + 20.0)
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
     assert float(found.plant.torque_offset) == pytest.approx(-20.0, rel=0.01)
-    (told,) = (w for w in found.warnings if "constant drive force" in w)
-    assert "is larger than its friction: a weight, a spring, or a sensor's bias" in told
-    assert "larger forwards" not in told
+    (warning,) = (w for w in found.warnings if "constant drive force" in w)
+    assert "is larger than its friction: a weight, a spring, or a sensor's bias" in warning
+    assert "larger forwards" not in warning
 
 
 def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
@@ -227,8 +227,8 @@ def test_air_drag_is_told_from_joint_friction():
         truth = torch.tensor(TRUTH, dtype=F64)
         errors.append(float((found.model.schedule.values / truth - 1).abs().max()))
         if drag:
-            told = {i.name: i for i in found.intervals}["drag quadratic"]
-            assert told.low < 0.05 < told.high
+            interval = {i.name: i for i in found.intervals}["drag quadratic"]
+            assert interval.low < 0.05 < interval.high
             assert {"intervals", "unidentifiable", "warnings"} <= found.to_dict().keys()
     assert errors[0] < 0.2 * errors[1]
 
@@ -238,9 +238,9 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     monkeypatch.setattr(HorizonResult, "lost_motion", lambda self, before, options: True)
     recording = swing(pendulum(), true_model(), seconds=2.0)
     found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=3)
-    assert sum(told.startswith("Windows of 1 s were skipped") for told in found.warnings) == 1
+    assert sum(warning.startswith("Windows of 1 s were skipped") for warning in found.warnings) == 1
     alone = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=3)
-    assert not any("were skipped" in told for told in alone.warnings)
+    assert not any("were skipped" in warning for warning in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
     monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
@@ -250,7 +250,7 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         )
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
-        assert sum("were skipped" in told for told in further.warnings) == 1
+        assert sum("were skipped" in warning for warning in further.warnings) == 1
     # A network is not to follow what its law could not.
     assert found.skipped_horizons == (1.0,)
     assert fit(network, pendulum(), recording, start=found, max_steps=2).skipped_horizons == (1.0,)
@@ -265,7 +265,7 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0, 1.5), max_steps=3
     )
     assert later.skipped_horizons == (1.0, 1.5)
-    assert sum("Windows of 1 and 1.5 s were skipped" in told for told in later.warnings) == 1
+    assert sum("Windows of 1 and 1.5 s were skipped" in warning for warning in later.warnings) == 1
 
 
 def test_irregular_stamps_are_followed():
@@ -411,9 +411,9 @@ def test_recordings_without_torque_beside_driven_ones_are_named():
                    for s, n in (((1.6, 0.8), "free"), ((2.0, 0.2), "other")))  # fmt: skip
     torque = replace(other, tau=np.full_like(other.q, 1e-3), name="driven")
     for recordings in ([free, torque], [torque, free]):
-        with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as said:
+        with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as caught:
             fit(LFM(2), pendulum(), recordings, method="equation_error")
-        assert len([w for w in said if "no torque" in str(w.message)]) == 1
+        assert len([w for w in caught if "no torque" in str(w.message)]) == 1
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="no torque is recorded")
         for alike in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
@@ -429,17 +429,17 @@ def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
 
 def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
     hanging = pendulum(convention=("absolute", "hanging"))
-    said = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=1.0)
-    unsaid = replace(said, convention=None)
+    stated = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=1.0)
+    unstated = replace(stated, convention=None)
     settings = {"fit_plant": False, "windows": (0.5,), "max_steps": 3}
     found = [
         fit(LFM(2, v_smooth=V_SMOOTH), plant, recording, **settings)
-        for plant, recording in ((hanging, unsaid), (pendulum(), said))
+        for plant, recording in ((hanging, unstated), (pendulum(), stated))
     ]
     assert torch.equal(found[0].model.schedule.values, found[1].model.schedule.values)
     assert found[0].residual == found[1].residual
     with pytest.raises(ValueError, match=r"absolute,hanging and relative,upright"):
-        fit(LFM(2), pendulum(), [said, unsaid])
+        fit(LFM(2), pendulum(), [stated, unstated])
 
 
 def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
@@ -469,7 +469,7 @@ def test_a_method_that_is_none_is_named():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (lambda m, p, r: (LFM, p, r), "`model` must be a friction model .*LFM"),
         (lambda m, p, r: (m, r, p), "`plant` must be a mechanism"),
@@ -477,9 +477,9 @@ def test_a_method_that_is_none_is_named():
         (lambda m, p, r: (m, p, 5), "a recording is a Recording, the path"),
     ],
 )
-def test_what_is_something_else_is_told(arguments, told):
+def test_what_is_something_else_is_told(arguments, message):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
-    with pytest.raises(TypeError, match=told):
+    with pytest.raises(TypeError, match=message):
         fit(*arguments(LFM(2), pendulum(), recording))
     with pytest.raises(TypeError, match="`start` must be the result of a fit, got a LFM"):
         fit(LFM(2), pendulum(), recording, start=LFM(2))
@@ -640,16 +640,16 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
 def test_what_stops_a_further_search_stops_the_fit_and_keeps_the_best(last):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     alone = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
-    told = []
+    stages = []
 
     def stop(stage, step):
-        told.append(stage)
+        stages.append(stage)
         return stage == last
 
     model = Stribeck(2, v_smooth=V_SMOOTH)
     found = fit(model, pendulum(), recording, windows=(0.5,), callback=stop)
-    assert told[0] == "0.5 s windows"
-    assert told.count(last) == 1
+    assert stages[0] == "0.5 s windows"
+    assert stages.count(last) == 1
     assert not found.converged
     assert "Stopped" in found.status
     assert found.residual < alone.residual

@@ -192,14 +192,14 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "told"),
+    ("ratio", "status"),
     [
         pytest.param(1.3, "30 % more than that of its constant law", marks=pytest.mark.slow),
         (0.95, "5 % less than that of its constant law"),
         (np.inf, "diverges"),
     ],
 )
-def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
+def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, status):
     joint, found = constant
 
     def squares(test, problem, *_):
@@ -213,7 +213,7 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert torch.equal(*(m.schedule.parameter_vector() for m in (kept.model, model)))
-    assert told in kept.status
+    assert status in kept.status
     assert any("constant law" in w for w in kept.warnings)
     qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(14, 1)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)

@@ -145,7 +145,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     as_left = moved()
     assert as_left < 3.0
     # How far it moves is up to the data; that the uncertainty of the law's fit bounds it is ours.
-    monkeypatch.setattr(Interval, "sd", property(lambda told: 1e-3 * open_[told.name]))
+    monkeypatch.setattr(Interval, "sd", property(lambda interval: 1e-3 * open_[interval.name]))
     assert moved() < min(1e-3, 0.1 * as_left)
 
 

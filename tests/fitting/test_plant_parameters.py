@@ -36,12 +36,12 @@ def test_a_wheel_has_no_angle_to_be_off_and_coasting_keeps_its_inertia():
 
 
 def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():
-    told = names(pendulum(), driven=(1,), largest_torque=1.0)
-    assert "torque offset 2 [N m]" in told
-    assert "torque offset 1 [N m]" not in told
-    assert "gravity 1" in told
+    terms = names(pendulum(), driven=(1,), largest_torque=1.0)
+    assert "torque offset 2 [N m]" in terms
+    assert "torque offset 1 [N m]" not in terms
+    assert "gravity 1" in terms
     # Nor has a lone drive a gain: it would be but the scale of the masses.
-    assert not [name for name in told if "gain" in name]
+    assert not [name for name in terms if "gain" in name]
     # Unless an arm sets the scale, whose inertia is kept.
     armed = names(rigs.tlrip("free"), driven=(0,), largest_torque=1.0)
     assert "torque gain 1" in armed

@@ -184,13 +184,13 @@ def geared():
 def test_a_gears_loss_needs_the_drives_torque(geared) -> None:
     recording, found = geared
     undriven = recording._replace(tau=None, name="swing")
-    told = "in swing, and gear reads the drive's torque; add tau or use dahl"
-    with pytest.raises(ValueError, match=told):
+    message = "in swing, and gear reads the drive's torque; add tau or use dahl"
+    with pytest.raises(ValueError, match=message):
         fit("gear", AXIS, undriven, method="equation_error")
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         score(found.plant, found.model, undriven, limit=False)
     # Before any fit, whose result would be lost.
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         compare(AXIS, ["viscous", "gear"], recording, undriven, callback=pytest.fail)
 
 

@@ -93,10 +93,10 @@ def test_info_says_what_the_friction_follows(
 ) -> None:
     file = save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json", ModelInfo(unit="m"))
     assert cli.main(["info", str(file)]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     period = float(found.fits["NFSlip"][0].model.schedule.period[0])
-    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in said
-    assert f"a period of {period:.4g} m\n" in said
+    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in printed
+    assert f"a period of {period:.4g} m\n" in printed
 
 
 def test_the_period_of_a_long_table_is_found() -> None:

@@ -84,12 +84,12 @@ def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
 
 
 def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
-    told = replace(found, warnings=("Too short: 1 < 2.",)).summary()
-    assert told.startswith("load-coulomb (LFM): good. Converged")
-    assert " mN RMS" in told
-    assert f"{found.intervals[0].value:.4g}" in told
-    assert told.endswith("- Too short: 1 < 2.")
-    assert all(line == line.rstrip() for line in told.splitlines())
+    summary = replace(found, warnings=("Too short: 1 < 2.",)).summary()
+    assert summary.startswith("load-coulomb (LFM): good. Converged")
+    assert " mN RMS" in summary
+    assert f"{found.intervals[0].value:.4g}" in summary
+    assert summary.endswith("- Too short: 1 < 2.")
+    assert all(line == line.rstrip() for line in summary.splitlines())
 
 
 def test_a_result_is_printed_in_two_lines(found: FitResult) -> None:
@@ -108,8 +108,8 @@ def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
 
 def test_a_law_of_ones_own_has_a_summary_too(found: FitResult) -> None:
     own = replace(laws.VISCOUS, name="grease")
-    told = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
-    assert told.startswith("FrictionModel: good")
+    summary = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
+    assert summary.startswith("FrictionModel: good")
 
 
 def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:

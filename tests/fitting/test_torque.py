@@ -143,11 +143,11 @@ def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
     assert values[:3] == pytest.approx(truth[:3], rel=0.4)
     assert values[0] + values[1] == pytest.approx(0.5, rel=0.15)
     assert 0.15 < values[3] < 0.6
-    told = {i.name: i for i in found.intervals}
-    assert len(told) == 4
-    assert all(i.low < i.value < i.high for i in told.values())
+    intervals = {i.name: i for i in found.intervals}
+    assert len(intervals) == 4
+    assert all(i.low < i.value < i.high for i in intervals.values())
     # The intervals do not hold that error.
-    assert told["F_d of joint1"].high < 0.15
+    assert intervals["F_d of joint1"].high < 0.15
     assert any("blurs friction at low speed" in warning for warning in found.warnings)
 
 

@@ -146,7 +146,7 @@ def test_moved_parameters_move_the_coefficients_so_far():
     vector = schedule.parameter_vector()
     root = 1e-3 * torch.randn(len(vector), 5, dtype=F64)
     qd, qdd = 5 * torch.randn(2, 3, 2, dtype=F64), 50 * torch.randn(2, 3, 2, dtype=F64)
-    told = CoefficientUncertainty(schedule, root).sd(qd, qdd)
+    predicted = CoefficientUncertainty(schedule, root).sd(qd, qdd)
 
     def at(moved):
         schedule.set_parameter_vector(vector + moved)
@@ -154,7 +154,7 @@ def test_moved_parameters_move_the_coefficients_so_far():
 
     # Central differences, right to the square of the step.
     slopes = torch.stack([(at(0.01 * r) - at(-0.01 * r)) / 0.02 for r in root.T])
-    torch.testing.assert_close(slopes.norm(dim=0), told, rtol=1e-6, atol=0)
+    torch.testing.assert_close(slopes.norm(dim=0), predicted, rtol=1e-6, atol=0)
 
 
 def test_pieces_make_no_difference_and_unknown_parameters_are_told():

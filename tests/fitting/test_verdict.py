@@ -42,8 +42,8 @@ def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
     for _ in range(400):
         y = design @ truth + noise * torch.randn(len(design), generator=g, dtype=F64)
         found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
-        told = confidence_intervals(NAMES, found, sd, -free, free)
-        hits += [i.low <= t <= i.high for i, t in zip(told, truth.tolist(), strict=True)]
+        intervals = confidence_intervals(NAMES, found, sd, -free, free)
+        hits += [i.low <= t <= i.high for i, t in zip(intervals, truth.tolist(), strict=True)]
     # 1200 trials of 95 %: a standard deviation is 0.6 %.
     assert sum(hits) / len(hits) == pytest.approx(0.95, abs=0.02)
 
@@ -101,8 +101,8 @@ def test_intervals_cover_where_residuals_are_not_alike():
         y = sizes * torch.randn(len(design), generator=g, dtype=F64)
         found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
         for name, spread in sd.items():
-            told = confidence_intervals(NAMES, found, spread, -free, free)
-            hits[name] += [i.low <= 0 <= i.high for i in told]
+            intervals = confidence_intervals(NAMES, found, spread, -free, free)
+            hits[name] += [i.low <= 0 <= i.high for i in intervals]
     covered = {name: sum(hit) / len(hit) for name, hit in hits.items()}
     # 1200 trials of 95 %: a standard deviation is 0.6 %.
     assert covered["sandwich"] == pytest.approx(0.95, abs=0.02)
@@ -165,8 +165,8 @@ def test_nothing_is_lost_where_all_is_told():
 
 def test_intervals_end_at_the_bounds():
     value, sd = torch.tensor([0.1], dtype=F64), torch.tensor([1.0], dtype=F64)
-    (told,) = confidence_intervals(("c",), value, sd, torch.zeros(1), torch.full((1,), 0.5))
-    assert (told.low, told.high) == (0.0, 0.5)
+    (interval,) = confidence_intervals(("c",), value, sd, torch.zeros(1), torch.full((1,), 0.5))
+    assert (interval.low, interval.high) == (0.0, 0.5)
 
 
 def test_warnings_name_what_is_wrong_and_are_silent_otherwise():

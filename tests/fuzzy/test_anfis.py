@@ -52,8 +52,8 @@ def naive(layer: Anfis, x: np.ndarray) -> np.ndarray:
         firing = [np.prod(one) for one in np.ndindex(*layer.terms) for one in [_pick(held, one)]]
         for o in range(layer.outputs):
             slopes, constant = consequents[g, o, :, :-1], consequents[g, o, :, -1]
-            said = constant + (slopes @ x[g] if layer.order == 1 else 0)
-            y[g, o] = np.dot(firing, said) / np.sum(firing)
+            consequent = constant + (slopes @ x[g] if layer.order == 1 else 0)
+            y[g, o] = np.dot(firing, consequent) / np.sum(firing)
     return y
 
 

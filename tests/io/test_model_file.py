@@ -165,9 +165,9 @@ def test_a_file_without_a_sound_mechanism_gives_none(
 
 
 def test_units_of_a_sliding_axis_are_those_of_forces() -> None:
-    said = describe(NFLFM(1), ModelInfo(unit="m"))
-    assert [c["unit"] for c in said["coefficients"]] == ["N s/m", "N"]
-    assert said["units"] == {"qd": "m/s", "qdd": "m/s^2", "load": "-", "tau_f": "N"}
+    description = describe(NFLFM(1), ModelInfo(unit="m"))
+    assert [c["unit"] for c in description["coefficients"]] == ["N s/m", "N"]
+    assert description["units"] == {"qd": "m/s", "qdd": "m/s^2", "load": "-", "tau_f": "N"}
 
 
 def test_the_hash_is_of_the_parameters_and_nothing_else() -> None:

@@ -54,7 +54,7 @@ def test_a_refusal_is_passed_on(run: Run) -> None:
 
 @posix
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ("os.abort()", "SIGABRT"),
         ("os.kill(os.getpid(), 11)", "SIGSEGV"),
@@ -63,8 +63,8 @@ def test_a_refusal_is_passed_on(run: Run) -> None:
         ("bytearray(2**34)", "MemoryError"),
     ],
 )
-def test_how_it_perished_is_told(run: Run, body: str, said: str) -> None:
-    with pytest.raises(sandbox.WorkerDied, match=said):
+def test_how_it_perished_is_told(run: Run, body: str, message: str) -> None:
+    with pytest.raises(sandbox.WorkerDied, match=message):
         run(body)
 
 

@@ -299,9 +299,11 @@ def test_a_unit_in_brackets_that_is_not_known_is_told(
 ) -> None:
     text = written(",", False, "time{0}angle [gon]{0}joint[2]")
     columns = {"q1": "angle [gon]", "q2": "joint[2]"}
-    with pytest.warns(RecordingWarning, match=r"angle \[gon\]: 'gon' is not a known unit") as said:
+    with pytest.warns(
+        RecordingWarning, match=r"angle \[gon\]: 'gon' is not a known unit"
+    ) as caught:
         assert np.array_equal(read(tmp_path, text, columns=columns).q, Q)
-    assert not [w for w in said if "joint[2]" in str(w.message)]  # an index
+    assert not [w for w in caught if "joint[2]" in str(w.message)]  # an index
     recwarn.clear()
     read(tmp_path, text, columns=columns | {"q1": "angle [gon]:mrad"})
     assert not [w for w in recwarn if "gon" in str(w.message)]

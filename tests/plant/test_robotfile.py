@@ -279,9 +279,9 @@ def test_what_is_no_chain_is_refused_by_name(tmp_path, old, new, message):
     rigs.read(path)
     assert old in PENDULUM
     path.write_text(PENDULUM.replace(old, new))
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as caught:
         rigs.read(path)
-    assert str(path) in str(told.value)
+    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(

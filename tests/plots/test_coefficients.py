@@ -58,9 +58,9 @@ def test_constant_coefficients_are_told_and_not_drawn(motion):
     figure = plots.coefficients_over_time({"NFCVFM": model}, motion)
     first, second = figure.axes
     assert first.get_ylabel() == "$h$ [-]"
-    told = "constant:\n$F_\\mathrm{c}$ = %s\n$F_\\mathrm{v}$ = %s\n$k_\\mathrm{h}$ = 0"
-    assert first.get_title() == "joint1\n" + told % ("8 mN m", "2 mN m s/rad")
-    assert second.get_title() == "joint2\n" + told % ("5 mN m", "0.3 N m s/rad")
+    constants = "constant:\n$F_\\mathrm{c}$ = %s\n$F_\\mathrm{v}$ = %s\n$k_\\mathrm{h}$ = 0"
+    assert first.get_title() == "joint1\n" + constants % ("8 mN m", "2 mN m s/rad")
+    assert second.get_title() == "joint2\n" + constants % ("5 mN m", "0.3 N m s/rad")
     figure.draw_without_rendering()
 
 
@@ -68,8 +68,8 @@ def test_a_figure_of_constants_alone_has_only_their_values(motion):
     models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": NFLFM(2, [1e-3, 1e-2])}
     figure = plots.coefficients_over_time(models, motion)
     assert not any(ax.lines or ax.axison for ax in figure.axes)
-    told = "constant:\n$B$ = 2 / 1 mN m s/rad\n$C$ = 10 mN m"
-    assert [ax.get_title() for ax in figure.axes] == [f"joint{k}\n{told}" for k in (1, 2)]
+    constants = "constant:\n$B$ = 2 / 1 mN m s/rad\n$C$ = 10 mN m"
+    assert [ax.get_title() for ax in figure.axes] == [f"joint{k}\n{constants}" for k in (1, 2)]
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # such as of a layout without room for its text
         figure.draw_without_rendering()
@@ -98,8 +98,8 @@ def test_intervals_are_those_of_the_fit():
     found = fit(NCFM(1), plant, recording, method="equation_error")
     value = float(found.model.schedule.values)
     (joint,) = plant.joint_names
-    told = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
-    figure = plots.coefficient_intervals({"known": replace(found, intervals=(told,)),
+    interval = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
+    figure = plots.coefficient_intervals({"known": replace(found, intervals=(interval,)),
                                           "unknown": replace(found, intervals=())})  # fmt: skip
     (ax,) = figure.axes
     (low, high), (edge, other) = (

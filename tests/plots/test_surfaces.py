@@ -109,7 +109,7 @@ def test_a_coefficient_that_is_not_fitted_is_not_drawn(draw):
     model = NFStribeck(1, terms=(2, 2), head_units=2)
     model.schedule.set_range(5.0, [-100.0, 100.0])
     figure = draw(model)
-    said = [f"{ax.get_ylabel()} {ax.get_title()}" for ax in figure.axes]
-    symbols = {word for text in said for word in text.split() if word.startswith("$")}
+    labels = [f"{ax.get_ylabel()} {ax.get_title()}" for ax in figure.axes]
+    symbols = {word for text in labels for word in text.split() if word.startswith("$")}
     assert len(symbols) == 4
     assert not any("delta" in symbol for symbol in symbols)

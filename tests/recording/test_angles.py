@@ -107,8 +107,8 @@ def test_whatever_says_a_convention_is_understood(convention: AngleConvention) -
 
     plant = Plant()
     plant.convention = (convention.angles, convention.measured_from)  # type: ignore[attr-defined]
-    for said in (convention, str(convention), str(convention).split(","), plant):
-        assert AngleConvention.of(said) == convention  # type: ignore[arg-type]
+    for form in (convention, str(convention), str(convention).split(","), plant):
+        assert AngleConvention.of(form) == convention  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("given", [None, 3, "", (), [1, 2], {"absolute": "hanging"}, b"absolute"])

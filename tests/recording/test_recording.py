@@ -125,11 +125,11 @@ def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
     """As of an acrobot, whose one motor is between its links."""
     recording = swing()
     table = recording.to_pandas().drop(columns=["tau1"])
-    said = r"'run': no column tau1, .* to be passive.*columns=\{\"tau1\": \"\.\.\.\"\}"
-    with pytest.warns(RecordingWarning, match=said):
+    message = r"'run': no column tau1, .* to be passive.*columns=\{\"tau1\": \"\.\.\.\"\}"
+    with pytest.warns(RecordingWarning, match=message):
         back = Recording.from_pandas(table, columns=columns, name="run")
     table.to_csv(tmp_path / "run.csv", index=False)
-    with pytest.warns(RecordingWarning, match=said):
+    with pytest.warns(RecordingWarning, match=message):
         read = Recording.read(tmp_path / "run.csv", columns=columns)
     assert recording.tau is not None
     for found in (back, read):
@@ -166,10 +166,10 @@ def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
 ) -> None:
     table = swing(joints=joints).to_pandas().filter(regex="time|q")
     table[name] = 1.0
-    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as said:
+    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as caught:
         assert Recording.from_pandas(table).tau is None
-    assert len(said) == 1
-    assert f'columns={{"{own}": "{name}"}}' in str(said[0].message)
+    assert len(caught) == 1
+    assert f'columns={{"{own}": "{name}"}}' in str(caught[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Who has named all torques knows what else there is.
@@ -182,8 +182,8 @@ def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
 def test_a_current_is_no_torque_and_not_left_out_without_a_word(name: str) -> None:
     table = swing(joints=1).to_pandas().filter(regex="time|q")
     table[name] = 1.0
-    said = "looks like motor current and is not read; .* give the rig a `motor` with its `torque_"
-    with pytest.warns(RecordingWarning, match=said):
+    match = "looks like motor current and is not read; .* give the rig a `motor` with its `torque_"
+    with pytest.warns(RecordingWarning, match=match):
         assert Recording.from_pandas(table).tau is None
 
 
@@ -485,7 +485,7 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
 
 
 @pytest.mark.parametrize(
-    ("column", "options", "told"),
+    ("column", "options", "warning_count"),
     [
         ("position", {"columns": {"q1": "position:counts/4096"}}, 0),
         ("position [deg]", {"columns": {"q1": "position [deg]"}}, 0),
@@ -495,14 +495,14 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
     ],
 )
 def test_a_wheel_whose_unit_is_stated_is_not_taken_for_one_in_degrees(
-    column: str, options: dict[str, Any], told: int
+    column: str, options: dict[str, Any], warning_count: int
 ) -> None:
     time = 0.01 * np.arange(100)
     table = pd.DataFrame({"time": time, column: np.rint(1e4 * np.sqrt(time)) / 2})
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Recording.from_pandas(table, **options)
-    assert sum("degrees" in str(warning.message) for warning in said) == told
+    assert sum("degrees" in str(warning.message) for warning in caught) == warning_count
 
 
 def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
@@ -511,9 +511,9 @@ def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Recording(time, whirling)
-    with pytest.warns(RecordingWarning) as said:
+    with pytest.warns(RecordingWarning) as caught:
         Recording(time, np.remainder(whirling, 2 * np.pi))
-    assert not any("degrees" in str(warning.message) for warning in said)
+    assert not any("degrees" in str(warning.message) for warning in caught)
 
 
 @pytest.mark.parametrize("low", [0.0, -np.pi])
@@ -603,26 +603,26 @@ def test_metres_are_no_angles_of_a_plant() -> None:
     turns, slides = (Rig(("relative", "upright"), 0, unit) for unit in ("rad", "m"))
     for unit, plant in (("m", turns), ("rad", slides)):
         recording = swing(unit=unit, name="run")
-        said = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
-        with pytest.raises(ValueError, match=said):
+        message = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
+        with pytest.raises(ValueError, match=message):
             recording.resolve_convention(plant)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             recording.joint_coordinates(plant)
 
 
 def test_what_a_recording_does_not_say_the_plant_says() -> None:
     hanging = Rig(("absolute", "hanging"), 0)
-    said = swing(convention="absolute,hanging")
-    unsaid = replace(said, convention=None)
-    assert unsaid.convention is None
-    assert unsaid.resolve_convention(hanging) == said.convention
-    assert unsaid.joint_coordinates(hanging).digest() == said.joint_coordinates().digest()
+    stated = swing(convention="absolute,hanging")
+    unstated = replace(stated, convention=None)
+    assert unstated.convention is None
+    assert unstated.resolve_convention(hanging) == stated.convention
+    assert unstated.joint_coordinates(hanging).digest() == stated.joint_coordinates().digest()
     # What it says itself is stronger.
-    assert said.resolve_convention(Rig(("relative", "upright"), 0)) == said.convention
+    assert stated.resolve_convention(Rig(("relative", "upright"), 0)) == stated.convention
     with pytest.raises(ValueError, match="has no angle convention; give the plant"):
-        unsaid.joint_coordinates()
-    assert unsaid.digest() != said.digest()
-    assert "that of the plant" in repr(unsaid)
+        unstated.joint_coordinates()
+    assert unstated.digest() != stated.digest()
+    assert "that of the plant" in repr(unstated)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -130,7 +130,7 @@ def test_what_a_reader_of_the_screen_needs(page):
 
 def test_verdicts_warnings_and_rules_are_told(page):
     text = " ".join("".join(page.text).split())
-    for said in (
+    for expected in (
         "load-coulomb (LFM) predicts the test recordings best: 100 mrad, where no friction leaves "
         "2000.",
         "Fit of load-coulomb (LFM): good",
@@ -145,7 +145,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
         "nfriction export",
         "training recording",
     ):
-        assert said in text
+        assert expected in text
     assert text.count("At a bound") == 1
 
 

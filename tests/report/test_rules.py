@@ -19,10 +19,10 @@ def test_a_rule_says_what_the_model_gives_where_its_words_hold():
             qdd = torch.full((2,), acceleration[rule.acceleration], dtype=torch.float64)
             if qd[j] == 0:  # acceleration along the motion has no meaning at rest
                 continue
-            said = torch.tensor(rule.values, dtype=torch.float64)
+            expected = torch.tensor(rule.values, dtype=torch.float64)
             # tanh of the direction is 1 to rounding at these speeds.
             torch.testing.assert_close(
-                said, model.coefficients(qd, qdd)[j].detach(), rtol=1e-9, atol=0
+                expected, model.coefficients(qd, qdd)[j].detach(), rtol=1e-9, atol=0
             )
 
 

@@ -33,9 +33,9 @@ def test_a_damaged_model_or_figure_is_said_and_does_not_stop_the_report(tmp_path
     (folder / "figures" / "rmse_test.png").write_text("<svg onload=alert(1)>")
     run = read_run(folder)
     assert "LFM" not in run.models
-    said = " ".join(run.notes)
-    assert "LFM" in said
-    assert "rmse_test.png: not a PNG or GIF file" in said
+    notes = " ".join(run.notes)
+    assert "LFM" in notes
+    assert "rmse_test.png: not a PNG or GIF file" in notes
     assert "<svg" not in to_html(run)
 
 

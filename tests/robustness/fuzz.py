@@ -65,8 +65,8 @@ class Outcome:
     perished: Counter[str] = field(default_factory=Counter)
     faults: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
-    def add_fault(self, kind: str, case: int, told: str) -> None:
-        count, first, text = self.faults.get(kind, (0, case, told))
+    def add_fault(self, kind: str, case: int, description: str) -> None:
+        count, first, text = self.faults.get(kind, (0, case, description))
         self.faults[kind] = count + 1, first, text
 
     def __str__(self) -> str:
@@ -76,8 +76,8 @@ class Outcome:
             f"({self.seconds:.0f} s)"
         ]
         lines += [f"  apart, {kind}: {count} cases" for kind, count in self.perished.items()]
-        for kind, (count, first, told) in self.faults.items():
-            lines.append(f"  {kind}: {count} cases, first {first}\n{told}")
+        for kind, (count, first, description) in self.faults.items():
+            lines.append(f"  {kind}: {count} cases, first {first}\n{description}")
         return "\n".join(lines)
 
 
@@ -134,7 +134,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
         os.close(reader)
         _child(work, first, shared, writer, folder)
     os.close(writer)
-    told = b""
+    output = b""
     last, since, hung = first, time.monotonic(), False
     while True:
         ready, _, _ = select.select([reader], [], [], 1.0)
@@ -142,7 +142,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
             part = os.read(reader, 1 << 16)
             if not part:
                 break
-            told += part
+            output += part
         case = _COUNTS.unpack(shared)[0]
         if case != last:
             last, since = case, time.monotonic()
@@ -155,7 +155,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     case, loaded, refused = _COUNTS.unpack(shared)
     outcome.loaded += loaded
     outcome.refused += refused
-    for line in told.decode().splitlines():
+    for line in output.decode().splitlines():
         outcome.add_fault(*json.loads(line))
     if status and os.WIFEXITED(status) and os.waitstatus_to_exitcode(status) == _HARNESS:
         raise RuntimeError(f"{work.loader.name}: the harness itself failed, see above.")

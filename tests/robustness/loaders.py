@@ -355,8 +355,8 @@ _MJCF = b"""<mujoco model="bench"><option gravity="0 0 -9.7"/><compiler angle="d
 
 def _read_rig(path: Path) -> None:
     plant = rigs.read(path)
-    said = plant.to_dict()
-    assert rigs.from_dict(said).to_dict() == said
+    entries = plant.to_dict()
+    assert rigs.from_dict(entries).to_dict() == entries
     q = torch.zeros(plant.joints, dtype=torch.float64)
     assert plant.mass_matrix(q).shape == (plant.joints, plant.joints)
     assert all(bool(b.isfinite().all()) for b in plant.buffers())

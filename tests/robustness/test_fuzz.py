@@ -70,9 +70,9 @@ def test_the_harness_sees_what_it_looks_for(monkeypatch: pytest.MonkeyPatch) -> 
     )  # fmt: skip
     monkeypatch.setitem(LOADERS, "broken", broken)
     outcome = fuzz("broken", 40, seconds=0.05, memory=2**28)
-    told = " ".join(outcome.faults)
+    faults = " ".join(outcome.faults)
     for kind in ("Hang", "MemoryError", "KeyError", "without the file's name", "SIGABRT"):
-        assert kind in told
+        assert kind in faults
     assert outcome.loaded + outcome.refused + sum(n for n, *_ in outcome.faults.values()) == 40
 
 

@@ -78,13 +78,13 @@ def broken_off(
         # Importing takes most of the first seconds of every run but the first.
         time.sleep(rng.uniform(0.0, 1.5) + (0.0 if kill == 0 else rng.uniform(1.0, 4.0)))
         if process.poll() is None:
-            told = end(process, how)
+            messages = end(process, how)
             if how == signal.SIGINT and process.returncode:
-                assert process.returncode in (130, -signal.SIGINT), told
+                assert process.returncode in (130, -signal.SIGINT), messages
         check(folder)
     process = begin(words)
-    told = process.communicate(timeout=500)[1]
-    assert process.returncode == 0, told
+    messages = process.communicate(timeout=500)[1]
+    assert process.returncode == 0, messages
 
 
 def whole(words: list[str]) -> None:
@@ -160,9 +160,9 @@ def test_ctrl_c_ends_with_what_was_reached_and_says_where(tmp_path: Path) -> Non
     deadline = time.monotonic() + 200
     while not state.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
-    told = end(process, signal.SIGINT)
-    assert process.returncode == 130, told
-    assert f"progress is saved in {folder}" in told
-    assert "Traceback" not in told
+    messages = end(process, signal.SIGINT)
+    assert process.returncode == 130, messages
+    assert f"progress is saved in {folder}" in messages
+    assert "Traceback" not in messages
     assert state.exists()
     assert not [p for p in folder.rglob("*") if p.suffix == ".part"]

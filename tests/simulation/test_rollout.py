@@ -406,13 +406,13 @@ def test_too_steep_friction_is_refused_and_the_message_mends_it(substeps):
     model = LFM(2, coefficients, v_smooth=1e-3)
     with pytest.raises(ValueError, match="too steep") as caught:
         run(model, steps=5, substeps=substeps)
-    said = re.search(r"substeps=(\d+) or v_smooth >= (\S+)", str(caught.value))
-    assert said is not None
-    assert int(said[1]) == required_substeps(CHAIN, model, 1e-3) > substeps
-    run(model, steps=5, substeps=int(said[1]))
+    suggestion = re.search(r"substeps=(\d+) or v_smooth >= (\S+)", str(caught.value))
+    assert suggestion is not None
+    assert int(suggestion[1]) == required_substeps(CHAIN, model, 1e-3) > substeps
+    run(model, steps=5, substeps=int(suggestion[1]))
     with pytest.raises(ValueError, match="too steep"):
-        run(model, steps=5, substeps=int(said[1]) - 1)
-    run(LFM(2, coefficients, v_smooth=float(said[2])), steps=5, substeps=substeps)
+        run(model, steps=5, substeps=int(suggestion[1]) - 1)
+    run(LFM(2, coefficients, v_smooth=float(suggestion[2])), steps=5, substeps=substeps)
 
 
 def test_the_stability_limit_is_where_rk4_turns_unstable():

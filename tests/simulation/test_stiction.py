@@ -154,7 +154,7 @@ def test_a_score_may_take_it():
     truth = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=0.02)
     recording = swing(pendulum(), truth, seconds=1.0)
     sharp = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=1e-6)
-    told = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="time_stepping")
-    assert np.isfinite(told.free_run.all)
-    assert told.free_run.all < 0.01
-    assert told.windows["0.5"].all < 0.01
+    scored = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="time_stepping")
+    assert np.isfinite(scored.free_run.all)
+    assert scored.free_run.all < 0.01
+    assert scored.windows["0.5"].all < 0.01

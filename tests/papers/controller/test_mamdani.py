@@ -41,8 +41,8 @@ def naive(rules: RuleBase, x: np.ndarray, points: int, centroid: str) -> np.ndar
                     member = next(one for one in asked.sets if one.name == term)
                     held.append(float(member(torch.tensor(value, dtype=FLOAT64))))
             if rule.then[o] != "*":
-                said = next(one for one in variable.sets if one.name == rule.then[o])
-                shape = said(torch.as_tensor(universe)).numpy()
+                consequent = next(one for one in variable.sets if one.name == rule.then[o])
+                shape = consequent(torch.as_tensor(universe)).numpy()
                 total = np.maximum(total, np.minimum(shape, min(held) * rule.weight))
         weight = np.ones(points)
         if centroid == "trapezoid":

@@ -33,9 +33,9 @@ def test_targets_are_what_the_controllers_say_of_the_measured_motion(tmp_path: P
     assert samples.output_names == ("B", "C")
     assert (samples.x[..., 0] >= 0).all()
     for joint, number in enumerate((2, 3, 4)):
-        said = paper_controller(number)(samples.x[:, joint, 0], samples.x[:, joint, 1])
+        expected = paper_controller(number)(samples.x[:, joint, 0], samples.x[:, joint, 1])
         # The files have nine digits.
-        torch.testing.assert_close(said, samples.y[:, joint], rtol=1e-7, atol=0.0)
+        torch.testing.assert_close(expected, samples.y[:, joint], rtol=1e-7, atol=0.0)
 
 
 def test_what_was_built_is_read_later_and_a_change_is_noticed(tmp_path: Path) -> None:

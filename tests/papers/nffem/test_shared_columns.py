@@ -139,7 +139,7 @@ def test_units_far_from_every_sample_cost_no_more() -> None:
     network, x = RBFNetwork(1, units=5), noise(0, 200, 1, 2)
     with torch.no_grad():
         network.log_widths.fill_(-9.0)
-        said = network.activations(x)
+        activations = network.activations(x)
     tiny = torch.finfo(F64).tiny
-    assert (said.square() >= tiny).all()
-    assert said.min() < 1e-100
+    assert (activations.square() >= tiny).all()
+    assert activations.min() < 1e-100

@@ -96,9 +96,9 @@ def test_tables_6_to_9_are_the_classes(tmp_path: Path) -> None:
 
 
 def test_fits_that_did_not_converge_are_named_at_the_end(tmp_path: Path) -> None:
-    said = page.text(workspace(tmp_path, {})).splitlines()
-    assert "1 of 19 fits did not converge (ALFM)" in said[-1]
-    assert any(line.split() == ["NFLFM-papers", "ended"] for line in said)
+    lines = page.text(workspace(tmp_path, {})).splitlines()
+    assert "1 of 19 fits did not converge (ALFM)" in lines[-1]
+    assert any(line.split() == ["NFLFM-papers", "ended"] for line in lines)
 
 
 def test_what_a_step_saves_within_a_law(tmp_path: Path) -> None:
@@ -146,6 +146,6 @@ def test_everything_is_written_and_said(tmp_path: Path) -> None:
     long = pd.read_csv(tmp_path / "rmse.csv")
     # Models, recordings, kinds of error (two drives and one window), joints and all of them.
     assert len(long) == len(EVERY) * 3 * 3 * 4
-    said = page.text(made)
+    text = page.text(made)
     for name in (*tables.NINE, "Table 11", "Table IV", "how the fits ended"):
-        assert name in said
+        assert name in text

@@ -245,8 +245,8 @@ def build_script(*words: object) -> int:
 @pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
 def test_builder_script(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert build_script(name, "--out", tmp_path, "--quick") == 0
-    said, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
-    assert re.findall(r"10000 samples", said) == ["10000 samples"] * len(files)
+    printed, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
+    assert re.findall(r"10000 samples", printed) == ["10000 samples"] * len(files)
     assert len(files) == {"experiment_twin": 1, "rtip_twin": 4, "tlrip_controller": 3}[name]
 
 
