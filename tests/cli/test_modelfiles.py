@@ -1,4 +1,4 @@
-"""`fit`, `info` and `export`: from a recording to a model file, what it says, and its artefact."""
+"""`fit`, `info` and `export`: from a recording to a model file, its description and artefact."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def values(text: str, row: str) -> list[float]:
     return [float(word) for word in found.removeprefix(row).split()]
 
 
-def test_what_fit_prints_next_works(
+def test_next_command_printed_by_fit_works(
     bench: Path, fitted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(fitted)]
@@ -57,7 +57,7 @@ def test_what_fit_prints_next_works(
     torch.jit.load(bench / "x" / "m.pt")
 
 
-def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
+def test_unconverged_fit_is_not_recommended_for_export(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(tmp_path / "m.json")]
@@ -69,7 +69,7 @@ def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
     assert "next:" not in output
 
 
-def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
+def test_unusable_fit_is_exported_with_its_rating(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     time = 0.01 * np.arange(200)
@@ -90,7 +90,7 @@ def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
     assert f"Rating of the fit: {rating}" in (tmp_path / "m.h").read_text()
 
 
-def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
+def test_model_unsuitable_for_controllers_is_not_recommended_for_export(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def quick(*task: Any, **_: object) -> FitResult:
@@ -107,7 +107,7 @@ def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
         q, tau = run.q.numpy()[::each], force[::each]
         Recording(time[::each], q, tau=tau, unit="m").write(tmp_path / f"{name}.csv")
     out = ["--rig", str(tmp_path / "axis.json"), "--out", str(tmp_path / "m.json")]
-    # A law with memory is advanced by one sample time, and recordings of different ones give none.
+    # A law with memory is advanced by one sample time; recordings with different ones define none.
     for model, names, exportable in (("gear", "a", True), ("dahl", "ab", False)):
         logs = [str(tmp_path / f"{name}.csv") for name in names]
         assert cli.main(["fit", *logs, "--model", model, *out]) == 0
@@ -115,7 +115,9 @@ def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
         assert ("next:" in output) is exportable, output
 
 
-def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_prints_the_contents_of_the_file(
+    fitted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["info", str(fitted)]) == 0
     output = capsys.readouterr().out
     model = load(fitted)
@@ -124,15 +126,13 @@ def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixtu
         assert word in output
 
 
-def test_info_of_a_file_that_says_little(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_of_a_minimal_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = NFLFM(2, [3.0, 4.0])
     save(model, tmp_path / "m.json", ModelInfo(unit="m"))
     assert cli.main(["info", str(tmp_path / "m.json")]) == 0
     output = capsys.readouterr().out
     assert "B [N s/m]" in output
-    # An untrained network deviates nowhere from its reference.
+    # An untrained network equals its reference everywhere.
     assert "at rest" not in output
     assert values(output, "joint2") == pytest.approx([3.0, 4.0])
 
