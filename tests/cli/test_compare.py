@@ -255,7 +255,7 @@ def test_process_count_is_checked_and_does_not_change_results(
     assert (out / "table.csv").read_bytes() == (compared / "table.csv").read_bytes()
 
 
-def test_log_file_records_the_run_and_the_console_stays_silent(
+def test_log_file_records_progress_that_the_console_omits(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "night.log"
@@ -294,8 +294,8 @@ def test_demo_writes_results_and_figures(
 
 
 @pytest.mark.slow
-def test_triple_pendulum_data_card_experiment_is_reproduced(data_dir: Path, tmp_path: Path) -> None:
-    """Half of the data card's experiment: viscous friction has 11.6 mrad in 10 s, 6.1 mrad in 5 s."""
+def test_triple_pendulum_errors_match_the_data_card(data_dir: Path, tmp_path: Path) -> None:
+    """Half the data card's experiment: viscous friction has 11.6 mrad in 10 s and 6.1 mrad in 5 s."""
     data = data_dir / "multiarm_pendulum"
     words = [str(data / "triple_b0.csv.gz"), "--test", str(data / "triple_b2.csv.gz")]
     words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]

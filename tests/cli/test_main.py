@@ -154,7 +154,7 @@ def test_invalid_options_are_refused(bench: Path, failing, more: list[str], mess
     assert not (bench / "bad").exists()
 
 
-def test_existing_folders_and_files_are_not_overwritten(bench: Path, failing) -> None:
+def test_output_paths_blocked_by_files_are_refused(bench: Path, failing) -> None:
     words = [bench / "a.csv.gz", "--rig", bench / "bench.json", "--out"]
     for out in (bench / "b.csv", bench / "b.csv" / "under"):
         assert "in its way" in failing("compare", *words, out)
