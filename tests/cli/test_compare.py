@@ -295,7 +295,7 @@ def test_demo_writes_results_and_figures(
 
 @pytest.mark.slow
 def test_triple_pendulum_errors_match_the_data_card(data_dir: Path, tmp_path: Path) -> None:
-    """Half the data card's experiment: viscous friction has 11.6 mrad in 10 s and 6.1 mrad in 5 s."""
+    """Half of the data card's experiment: viscous friction has 11.6 mrad in 10 s, 6.1 in 5 s."""
     data = data_dir / "multiarm_pendulum"
     words = [str(data / "triple_b0.csv.gz"), "--test", str(data / "triple_b2.csv.gz")]
     words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]

@@ -77,7 +77,7 @@ def test_predicts_the_torque_of_its_model(
 
 
 def test_hidden_state_follows_the_samples(fitted: FrictionEstimator) -> None:
-    """Over successive samples, an adaptive model's classes are those that a controller would see."""
+    """Over successive samples, an adaptive model's classes are those a controller would see."""
     rng = np.random.default_rng(0)
     model = ALFM(2, rng.uniform(1e-4, 1e-2, (2, 3, 2)).tolist())
     estimator = FrictionEstimator(pendulum(), "ALFM")
@@ -94,7 +94,7 @@ def test_hidden_state_follows_the_samples(fitted: FrictionEstimator) -> None:
 
 
 def test_law_with_memory_is_evaluated_along_a_recording(fitted: FrictionEstimator) -> None:
-    """Its torques, below breakaway and sliding, are those of the rollout that made the recording."""
+    """Its torques, below breakaway and sliding, equal those of the rollout that was recorded."""
     model = LuGre(1, [1.0, 0.5, 0.05, 300.0, 5.0, 0.4]).requires_grad_(False)
     time = np.arange(3001) * 1e-3
     tau = (np.array([0.7, 2.0])[(time > 1.5).astype(int)] * np.sin(6 * time))[:, None]
