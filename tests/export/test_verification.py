@@ -1,4 +1,4 @@
-"""Verification of artefacts: those of the model pass; those of another model or altered ones fail."""
+"""Verification of artefacts: those of the model pass; altered ones and other models' fail."""
 
 import json
 import subprocess

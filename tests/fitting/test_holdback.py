@@ -1,4 +1,4 @@
-"""A network is kept only where it predicts what it has not seen better than its constant law."""
+"""A network is kept only if it predicts hold-out data better than its constant law."""
 
 from dataclasses import replace
 
@@ -67,12 +67,12 @@ def vector(fitter):
     return fitter.friction.schedule.parameter_vector()
 
 
-def test_every_window_is_held_out_once(constant):
+def test_every_window_is_a_hold_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.1, 100.0):
         held_back = []
         for seen, judged in splits(search, motions, length):
-            # Several at a time, so that each lies between others.
+            # Several at a time, so that each lies between training windows.
             assert len(judged) >= FOLDS
             assert not set(seen.spans) & set(judged.spans)
             held_back += judged.spans
@@ -81,7 +81,7 @@ def test_every_window_is_held_out_once(constant):
 
 
 def test_windows_of_one_recording_count_once(constant, monkeypatch):
-    """They share a search, so that their scatter is not that between recordings."""
+    """They share a search, so their scatter is not that between recordings."""
     joint, found = constant
     validation = object.__new__(Validation)
     validation.options = DEFAULTS
@@ -98,13 +98,13 @@ def test_windows_of_one_recording_count_once(constant, monkeypatch):
 @pytest.mark.parametrize(
     ("errors", "lost"), [([1.1, 1.1, 3.0], True), ([1.1, 3.0], False), ([0.9, 1.1, 3.0], False)]
 )
-def test_a_network_worse_on_every_recording_is_lost(errors, lost):
+def test_network_worse_on_every_recording_is_rejected(errors, lost):
     new = torch.tensor(errors, dtype=F64)
     assert neurofuzzy._worse(torch.ones_like(new), new, 0.05) == lost
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_every_recording_is_held_out_once(constant, count):
+def test_every_recording_is_a_hold_out_once(constant, count):
     joint, found = constant
     windows = holdout_windows([joint] * count, [*found.motions] * count, 0.5, FOLDS)
     held_out = []
@@ -116,8 +116,8 @@ def test_every_recording_is_held_out_once(constant, count):
     assert sorted(held_out) == list(range(count))
 
 
-def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):
-    """As cross-validation leaves it, which takes blocks out of a recording."""
+def test_short_recording_with_a_gap_still_has_hold_out_windows(constant):
+    """As in cross-validation, which removes blocks from a recording."""
     joint, _ = constant
     samples = np.r_[0:60, len(joint) - 60 : len(joint)]
     gapped = Recording(time=joint.time[samples], q=joint.q[samples])
@@ -127,7 +127,7 @@ def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):
     assert all(len(seen) >= 2 and len(held_back) >= 1 for seen, held_back in found)
 
 
-def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant):
+def test_network_error_is_its_laws_plus_that_of_wrong_coefficients(constant):
     search, motions = refinement(constant), constant[1].motions
     seen, held_back = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
@@ -139,8 +139,8 @@ def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant)
     assert not vector(search).any()
 
 
-def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
-    """A smoother's error at the start says nothing of a law."""
+def test_window_is_scored_from_the_state_that_fits_best(constant):
+    """A smoother's error at the start is no error of the law."""
     search, motions = refinement(constant), constant[1].motions
     seen, held_back = splits(search, motions, 0.5, cut_for_folds)[0]
     law = replace(search, friction=constant[1].model)
@@ -153,7 +153,7 @@ def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
     assert settled == pytest.approx(rmse(held_back, problem, vector(law), NONE), rel=0.05)
 
 
-def test_a_network_that_diverges_errs_without_end(constant):
+def test_diverging_network_has_infinite_error(constant):
     search, motions = refinement(constant), constant[1].motions
     seen, held_back = splits(search, motions, 0.5)[0]
     wild = torch.full_like(vector(search), 1e6)
@@ -170,18 +170,18 @@ def test_a_network_that_diverges_errs_without_end(constant):
         ((0.1, 0.1, 0.1, np.inf), False),
     ],
 )
-def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
+def test_significant_gain_exceeds_its_scatter_over_windows(ratios, gained):
     law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
     network = law * torch.tensor(ratios, dtype=F64).square()
     assert improves(network, law) is gained
-    # The less chance is left to scatter, the larger has a gain to be.
+    # The more candidates are compared, the larger a gain has to be.
     assert improves(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
     assert improves(network, law, least=1.1) is (gained and max(ratios) < 1 / 1.1)
-    # A law that diverges loses to what does not.
+    # A law that diverges is worse than one that does not.
     assert improves(law, torch.where(law > 3, torch.inf, law))
 
 
-def test_a_model_settles_on_a_coefficient_of_zero(constant):
+def test_coefficient_of_zero_is_supported(constant):
     search, found = refinement(constant), constant[1]
     zero = replace(found, model=LFM(1, [[0.0, 2e-3]], v_smooth=V_SMOOTH))
     revert_to_constant(search.friction, zero)
@@ -199,7 +199,7 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
         (np.inf, "diverges"),
     ],
 )
-def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, status):
+def test_rejected_network_is_reset(constant, monkeypatch, ratio, status):
     joint, found = constant
 
     def squares(test, problem, *_):
@@ -220,7 +220,7 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, s
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_a_law_fitted_to_other_recordings_is_fitted_again(constant):
+def test_law_fitted_to_other_recordings_is_refitted(constant):
     joint, found = constant
     half = joint[: len(joint) // 2]
     kept = fit(
@@ -230,7 +230,7 @@ def test_a_law_fitted_to_other_recordings_is_fitted_again(constant):
     assert len(kept.residuals) < len(found.residuals)
 
 
-def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
+def test_fit_stopped_before_its_network_keeps_the_constant_law(constant):
     joint, found = constant
     stages = []
 
@@ -250,7 +250,7 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monkeypatch):
+def test_interrupt_during_hold_out_keeps_the_constant_law(constant, monkeypatch):
     joint, found = constant
     cost = ShootingProblem.cost
     judged = []

@@ -1,4 +1,4 @@
-"""The package stays shallow: few floors of imports, few arguments, no questions about types."""
+"""`fitting` stays shallow: few import levels, few arguments, no type tests."""
 
 import ast
 from functools import cache
@@ -24,7 +24,7 @@ def floor(module: str) -> int:
     return 1 + max(map(floor, imported), default=0)
 
 
-def test_at_most_eight_floors() -> None:
+def test_at_most_eight_import_levels() -> None:
     assert max(map(floor, TREES)) <= 8
 
 
@@ -39,7 +39,7 @@ def test_only_the_entry_point_has_more_than_eight_arguments() -> None:
     assert many == ["fit"]
 
 
-def test_no_schedule_is_asked_for_its_type() -> None:
+def test_no_schedule_is_tested_for_its_type() -> None:
     asked = [
         ast.unparse(node)
         for tree in TREES.values()

@@ -1,4 +1,4 @@
-"""What looks wrong about a recording is said, and of a sound one nothing."""
+"""Suspicious recordings raise warnings, and valid ones none."""
 
 from dataclasses import replace
 
@@ -19,13 +19,13 @@ def data_warnings_of(plant: PendulumChain, *recordings: Recording) -> tuple[str,
 
 
 def as_plant_says(recording: Recording) -> Recording:
-    """The same columns without a word on how they are written."""
+    """The same columns without a convention."""
     return Recording(recording.time, recording.q, name=recording.name)
 
 
 @pytest.mark.parametrize("zero", ["hanging", "upright"])
 @pytest.mark.parametrize("start", [(1.6, 0.8), (3.1, 0.02)])
-def test_a_free_swing_tells_which_zero_its_angles_have(zero, start):
+def test_free_swing_determines_the_zero_of_its_angles(zero, start):
     recording = as_plant_says(
         swing(pendulum(), MODEL, seconds=1.0, start=start, convention=f"absolute,{zero}")
     )
@@ -36,7 +36,7 @@ def test_a_free_swing_tells_which_zero_its_angles_have(zero, start):
     assert "`convention`" in warning
 
 
-def test_a_fit_says_it_once_and_by_either_method():
+def test_fit_repeats_the_warning_once_with_either_method():
     recording = as_plant_says(swing(pendulum(), MODEL, seconds=1.0, convention="absolute,hanging"))
     plant = pendulum(convention=("absolute", "upright"))
     for settings in ({"method": "equation_error"}, {"windows": (0.5,), "max_steps": 1}):
@@ -45,7 +45,7 @@ def test_a_fit_says_it_once_and_by_either_method():
 
 
 def resting(counts: int, **settings) -> tuple[PendulumChain, Recording]:
-    """A double pendulum that rests but for a flicker of its second encoder."""
+    """A double pendulum at rest except for a flicker of its second encoder."""
     time = np.arange(1000) * 2e-3
     q = np.zeros((1000, 2))
     q[::50, 1] = counts * COUNT
@@ -63,14 +63,14 @@ def test_joints_that_do_not_move_are_named(quantum):
 
 
 @pytest.mark.parametrize(("factor", "named"), [(1.0, False), (0.25, False), (4.0, True)])
-def test_a_count_larger_than_the_positions_show_is_named(factor, named):
+def test_stated_resolution_coarser_than_the_positions_is_named(factor, named):
     recording = swing(pendulum(), MODEL, seconds=1.0)
     warned = data_warnings_of(pendulum(position_quantum=factor * COUNT), recording)
     assert any("less than the `position_quantum` of 0.00307" in t for t in warned) is named
     assert len(warned) == named
 
 
-def test_a_count_unlike_that_of_other_recordings_is_named():
+def test_resolution_that_differs_between_recordings_is_named():
     first = swing(pendulum(), MODEL, seconds=1.0)
     # The second joint rests, and shows no count.
     still = replace(first, q=first.q * [1.0, 0.0], name="still")
@@ -84,17 +84,17 @@ def test_a_count_unlike_that_of_other_recordings_is_named():
     ]
 
 
-def test_a_joint_that_moves_in_one_recording_is_not_named():
+def test_joint_that_moves_in_one_recording_is_not_named():
     plant, rest = resting(0)
     moving = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging")
     assert data_warnings_of(plant, rest, moving) == ()
 
 
 @pytest.mark.parametrize(("stretch", "named"), [(1.02, 1), (1.0005, 0), (2.0, 0)])
-def test_clocks_that_differ_a_little_are_named(stretch, named):
+def test_slightly_different_clocks_are_named(stretch, named):
     first = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging", name="one")
     other = Recording(stretch * first.time, first.q, name="two", convention="relative,hanging")
-    # A third at a rate that was chosen hides nothing.
+    # A third recording with a chosen sample rate hides nothing.
     slow = Recording(10 * first.time, first.q, name="slow", convention="relative,hanging")
     found = data_warnings_of(pendulum(convention=("relative", "hanging")), first, other, slow)
     clocks = [w for w in found if "two has a sample every 2.04 ms, one every 2 ms" in w]
@@ -107,7 +107,7 @@ def test_neuro_fuzzy_coefficients_need_some_motion():
         fit(NFLFM(2), plant, rest)
 
 
-def test_a_joint_that_turns_with_the_last_never_moves_though_rounding_does():
+def test_locked_joint_is_named_despite_round_off():
     turning = np.sin(5 * 1e-3 * np.arange(1000))
     locked = Recording(1e-3 * np.arange(1000), np.stack([turning, turning + 0.3], 1), name="l",
                        convention="absolute,hanging")  # fmt: skip
@@ -119,7 +119,7 @@ def test_a_joint_that_turns_with_the_last_never_moves_though_rounding_does():
         fit(NFLFM(2), plant, locked)
 
 
-def test_of_a_motionless_recording_a_fit_knows_nothing():
+def test_fit_refuses_a_motionless_recording():
     plant, rest = resting(0)
     found = fit(LFM(2), plant, rest, windows=(0.5,), fit_plant=False)
     assert found.residual < 1e-12
@@ -128,7 +128,7 @@ def test_of_a_motionless_recording_a_fit_knows_nothing():
     assert any("joint2 never moves" in text for text in found.warnings)
 
 
-def test_where_nothing_is_left_over_nothing_is_told():
+def test_zero_residual_raises_no_warning():
     plant = PendulumChain([0.4], [0.4], convention=("absolute", "hanging"))
     rest = Recording(np.arange(1000) * 2e-3, np.zeros((1000, 1)))
     found = fit(CVFM(1), plant, rest, windows=(0.5,), drag=False)
@@ -136,7 +136,7 @@ def test_where_nothing_is_left_over_nothing_is_told():
     assert {"F_c of joint1", "F_v of joint1", "inertia 11"} < set(found.unidentifiable)
 
 
-def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
+def test_fit_refuses_a_flickering_encoder():
     time = np.arange(2000) * 2e-3
     q = COUNT * (np.random.default_rng(0).random(2000) < 0.5)
     plant = PendulumChain([0.4], [0.4], convention=("absolute", "hanging"))
@@ -147,7 +147,7 @@ def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
 
 
 @pytest.mark.parametrize("method", ["output_error", "equation_error"])
-def test_friction_of_a_joint_that_a_torque_never_moves_is_not_determined(method):
+def test_friction_of_a_joint_that_never_moves_is_unidentifiable(method):
     """The smoothed sign of a simulation creeps, which looks like information."""
     time = 2e-3 * np.arange(1500)
     tau = 0.25 * np.sin(3.0 * time)[:, None]

@@ -1,4 +1,4 @@
-"""A result shows itself: as text, as a table, in a notebook, as a figure."""
+"""Output of a result: text, table, notebook, figure."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def found() -> FitResult:
     return fit(LFM(1, v_smooth=0.01), AXIS, recording, method="equation_error", fit_plant=False)
 
 
-def test_the_table_has_every_coefficient_with_its_interval(found: FitResult) -> None:
+def test_table_has_every_coefficient_with_its_interval(found: FitResult) -> None:
     table = found.to_pandas()
     joint = AXIS.joint_names[0]
     assert list(table.index) == [f"B of {joint}", f"C of {joint}"]
@@ -36,20 +36,20 @@ def test_the_table_has_every_coefficient_with_its_interval(found: FitResult) -> 
     assert not table["note"].any()
 
 
-def test_the_table_notes_what_is_at_a_bound_or_unknown(found: FitResult) -> None:
+def test_table_marks_active_bounds_and_unidentifiable_values(found: FitResult) -> None:
     b, c = found.to_pandas().index
     assert list(replace(found, at_bounds=(b,)).to_pandas()["note"]) == ["at a bound", ""]
     unknown = replace(found, at_bounds=(b,), unidentifiable=(f"{b} with {c}",))
     assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
 
 
-def test_the_table_notes_a_coefficient_that_no_fit_varies(found: FitResult) -> None:
+def test_table_marks_fixed_coefficients(found: FitResult) -> None:
     table = replace(found, model=Stribeck(found.plant.joints), intervals=()).to_pandas()
     assert set(table["note"][["delta" in name for name in table.index]]) == {"not fitted"}
     assert not table["note"][["delta" not in name for name in table.index]].any()
 
 
-def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitResult) -> None:
+def test_collinear_plant_terms_do_not_make_a_fit_doubtful(found: FitResult) -> None:
     b = found.intervals[0].name
     good = replace(found, noise=found.residual, converged=True)
     for unknown, verdict in (
@@ -59,7 +59,7 @@ def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitR
         assert replace(good, unidentifiable=(unknown,)).usability[0] == verdict
 
 
-def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> None:
+def test_coefficients_without_an_interval_show_their_value(found: FitResult) -> None:
     table = replace(found, model=Stribeck(1), intervals=()).to_pandas()
     assert table.index[-1].startswith("delta of ")
     assert table["value"].iloc[-1] == 2.0
@@ -67,7 +67,7 @@ def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> 
 
 
 @pytest.mark.parametrize("kind", [NFLFM, ALFM])
-def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
+def test_motion_dependent_coefficients_name_their_reference_motion(
     found: FitResult, kind: type
 ) -> None:
     model = kind(1, [2.0, 1.5])
@@ -83,7 +83,7 @@ def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
     assert result.plot().axes
 
 
-def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
+def test_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
     summary = replace(found, warnings=("Too short: 1 < 2.",)).summary()
     assert summary.startswith("load-coulomb (LFM): good. Converged")
     assert " mN RMS" in summary
@@ -92,21 +92,21 @@ def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> 
     assert all(line == line.rstrip() for line in summary.splitlines())
 
 
-def test_a_result_is_printed_in_two_lines(found: FitResult) -> None:
+def test_result_is_printed_in_two_lines(found: FitResult) -> None:
     head, warned = repr(replace(found, warnings=("Too short: 1 < 2.",))).splitlines()
     assert head.startswith("FitResult of load-coulomb (LFM): good. Converged")
     assert warned == "Warnings: 1; see `summary()`."
     assert str(found) == repr(found)
 
 
-def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
+def test_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
     page = replace(found, warnings=("Too short: 1 < 2.",))._repr_html_()
     assert "load-coulomb (LFM): good" in page
     assert "<table" in page
     assert "<li>Too short: 1 &lt; 2.</li>" in page
 
 
-def test_a_law_of_ones_own_has_a_summary_too(found: FitResult) -> None:
+def test_user_defined_law_has_a_summary_too(found: FitResult) -> None:
     own = replace(laws.VISCOUS, name="grease")
     summary = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
     assert summary.startswith("FrictionModel: good")
@@ -117,7 +117,7 @@ def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
     assert replace(found, model=NCFM(1, [2.0]), intervals=()).plot().axes
 
 
-def test_a_recording_at_rest_has_no_motion_to_judge_by(found: FitResult) -> None:
+def test_recording_at_rest_has_no_relative_error(found: FitResult) -> None:
     motions = tuple(replace(m, q=0.0 * m.q) for m in found.motions)
     for noise in (0.0, 1e-9):
         verdict, reason = replace(found, motions=motions, noise=noise, residual=1e-3).usability
