@@ -374,7 +374,7 @@ def test_recording_with_different_friction_is_named(change, rate, named, monkeyp
 
 @pytest.mark.parametrize("chirp", [True, False])
 @pytest.mark.parametrize("mass", [1.0, 1.1])
-def test_wrong_law_or_mass_is_no_change_of_friction(chirp, mass):
+def test_wrong_law_or_mass_or_growth_is_no_change_of_friction(chirp, mass):
     plant = PendulumChain(**MOTOR | {"mass": [mass]})
     warned = warnings_of(plant, *warming(0.0, chirp))
     assert not any("friction of" in w or "loose" in w for w in warned)

@@ -70,13 +70,13 @@ def vector(fitter):
 def test_every_window_is_a_hold_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.1, 100.0):
-        held_back = []
+        hold_out = []
         for seen, judged in splits(search, motions, length):
             # Several at a time, so that each lies between training windows.
             assert len(judged) >= FOLDS
             assert not set(seen.spans) & set(judged.spans)
-            held_back += judged.spans
-        samples = [np.arange(first, last) for _, first, last in sorted(held_back)]
+            hold_out += judged.spans
+        samples = [np.arange(first, last) for _, first, last in sorted(hold_out)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
 
 
@@ -124,40 +124,40 @@ def test_short_recording_with_a_gap_still_has_hold_out_windows(constant):
     assert len(gapped.segments) == 2
     motion = kalman_smoother(gapped.time, gapped.q)
     found = holdout_splits(holdout_windows([gapped], [motion], 100.0, FOLDS), FOLDS)
-    assert all(len(seen) >= 2 and len(held_back) >= 1 for seen, held_back in found)
+    assert all(len(seen) >= 2 and len(hold_out) >= 1 for seen, hold_out in found)
 
 
-def test_network_error_is_its_laws_plus_that_of_wrong_coefficients(constant):
+def test_zero_network_has_its_laws_error_and_a_bad_one_a_larger(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5)[0]
+    seen, hold_out = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
-    of_law = rmse(held_back, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
+    of_law = rmse(hold_out, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         network = torch.full_like(vector(search), value)
         by_network = search.problem(seen, 1e-3, network)
-        assert least <= rmse(held_back, by_network, network, NONE) / of_law <= most
+        assert least <= rmse(hold_out, by_network, network, NONE) / of_law <= most
     assert not vector(search).any()
 
 
 def test_window_is_scored_from_the_state_that_fits_best(constant):
     """A smoother's error at the start is no error of the law."""
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5, cut_for_folds)[0]
+    seen, hold_out = splits(search, motions, 0.5, cut_for_folds)[0]
     law = replace(search, friction=constant[1].model)
     problem = law.problem(seen, 1e-4, vector(law))
-    off = replace(held_back, q0=held_back.q0 + 5e-3, qd0=held_back.qd0 - 0.05)
+    off = replace(hold_out, q0=hold_out.q0 + 5e-3, qd0=hold_out.qd0 - 0.05)
     from_off = replace(problem, windows=off)
     unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
     settled = rmse(off, problem, vector(law), NONE)
     assert settled < 0.1 * float(unsettled)
-    assert settled == pytest.approx(rmse(held_back, problem, vector(law), NONE), rel=0.05)
+    assert settled == pytest.approx(rmse(hold_out, problem, vector(law), NONE), rel=0.05)
 
 
 def test_diverging_network_has_infinite_error(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5)[0]
+    seen, hold_out = splits(search, motions, 0.5)[0]
     wild = torch.full_like(vector(search), 1e6)
-    assert rmse(held_back, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
+    assert rmse(hold_out, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_diverging_network_has_infinite_error(constant):
         ((0.1, 0.1, 0.1, np.inf), False),
     ],
 )
-def test_significant_gain_exceeds_its_scatter_over_windows(ratios, gained):
+def test_gain_must_exceed_its_scatter_over_windows(ratios, gained):
     law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
     network = law * torch.tensor(ratios, dtype=F64).square()
     assert improves(network, law) is gained
@@ -181,7 +181,7 @@ def test_significant_gain_exceeds_its_scatter_over_windows(ratios, gained):
     assert improves(law, torch.where(law > 3, torch.inf, law))
 
 
-def test_coefficient_of_zero_is_supported(constant):
+def test_law_with_a_zero_coefficient_is_restored(constant):
     search, found = refinement(constant), constant[1]
     zero = replace(found, model=LFM(1, [[0.0, 2e-3]], v_smooth=V_SMOOTH))
     revert_to_constant(search.friction, zero)
@@ -256,13 +256,13 @@ def test_interrupt_during_hold_out_keeps_the_constant_law(constant, monkeypatch)
     judged = []
 
     def interrupted(problem, x):
-        if len(problem.windows) == held_back:
+        if len(problem.windows) == hold_out:
             judged.append(x)
             raise KeyboardInterrupt
         return cost(problem, x)
 
     search = refinement(constant)
-    held_back = len(splits(search, found.motions, 0.5)[0][1])
+    hold_out = len(splits(search, found.motions, 0.5)[0][1])
     monkeypatch.setattr(ShootingProblem, "cost", interrupted)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)

@@ -117,7 +117,7 @@ def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
     assert replace(found, model=NCFM(1, [2.0]), intervals=()).plot().axes
 
 
-def test_recording_at_rest_has_no_relative_error(found: FitResult) -> None:
+def test_residual_larger_than_the_motion_is_doubtful(found: FitResult) -> None:
     motions = tuple(replace(m, q=0.0 * m.q) for m in found.motions)
     for noise in (0.0, 1e-9):
         verdict, reason = replace(found, motions=motions, noise=noise, residual=1e-3).usability

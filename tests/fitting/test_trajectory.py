@@ -236,7 +236,7 @@ def test_states_are_declared_blocks_only_if_independent(offset_sd):
 
 
 @pytest.mark.filterwarnings("error")
-def test_overflowing_derivatives_are_handled_by_the_search():
+def test_overflow_of_derivatives_is_passed_to_the_search():
     maps = [torch.full((4, 1, 3, n), 1e200, dtype=F64) for n in (3, 1)]
     _, after = _carry(*maps, torch.ones(1, 3, 2, dtype=F64), 2)
     assert not torch.isfinite(after).any()
