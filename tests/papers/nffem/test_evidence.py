@@ -28,7 +28,7 @@ def regression(seed: int, n: int = 60) -> tuple[Tensor, Tensor]:
 
 
 def predictive_std(fit: EvidenceResult, model: nn.Module, x: Tensor, noise: bool = True) -> Tensor:
-    """Standard deviation of a model's single output by the covariance and, optionally, the noise."""
+    """Standard deviation of a model's output by the covariance and, optionally, the noise."""
     rows = torch.cat([J for _, _, (J,) in jacobian_pieces(model, x)])
     return (((rows @ fit.covariance) * rows).sum(1) + noise * 0.5 / fit.beta).sqrt()
 

@@ -120,7 +120,7 @@ def test_tables_of_the_second_paper(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_order_violations_are_named(tmp_path: Path, law: str) -> None:
+def test_order_accepts_ties_and_reports_violations(tmp_path: Path, law: str) -> None:
     errors = {law: 3.0, f"A{law}": 2.0, f"NF{law}": 1.0}
     nine = {name: errors.get(name, 2.5) for name in tables.NINE}
     found = tables.order(workspace(tmp_path, nine))

@@ -253,7 +253,7 @@ def test_builder_script_writes_twins(
 
 
 @pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
-def test_builder_script_refuses_to_overwrite_or_misname_files(
+def test_builder_script_refuses_invalid_outputs_and_seeds(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "train_upright.csv.gz").write_bytes(b"of the twin of the TLRIP")
