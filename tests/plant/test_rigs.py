@@ -128,7 +128,7 @@ def test_bad_rig_files_raise_clear_errors(text: str, message: str, tmp_path: Pat
         rigs.read(write(tmp_path / "rig.json", text))
 
 
-def test_files_with_other_suffixes_are_refused(tmp_path: Path) -> None:
+def test_toml_is_read_and_other_suffixes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.json or \.toml"):
         rigs.read(write(tmp_path / "rig.yaml", "mass: 1"))
     with pytest.raises(ValueError, match=r"written as \.json"):
@@ -211,7 +211,7 @@ def test_states_that_are_no_tensors_are_refused_by_name() -> None:
         rigs.xl330().load([0.1], [0.0])  # type: ignore[arg-type]
 
 
-def test_arm_flags_are_restored_as_plain_numbers() -> None:
+def test_arm_must_be_an_arm_and_is_stored_as_plain_numbers() -> None:
     with pytest.raises(TypeError, match="`arm` must be an Arm"):
         PendulumChain([1.0], [1.0], arm={"inertia": 1.0, "length": 1.0})  # type: ignore[arg-type]
     arm = Arm(torch.tensor(1.0), np.float64(0.5))  # type: ignore[arg-type]

@@ -122,6 +122,6 @@ def test_motors_of_several_links_refuse_absolute_angles() -> None:
     np.testing.assert_allclose(q, np.stack([np.sin(time), 2 * np.sin(time)], 1))
 
 
-def test_motor_of_a_rotor_is_converted_from_a_dictionary() -> None:
+def test_motor_of_a_rotor_must_be_a_motor() -> None:
     with pytest.raises(TypeError, match="must be a Motor"):
         Rotor(0.02, motor={"gear_ratio": 5})  # type: ignore[arg-type]

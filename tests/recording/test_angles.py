@@ -49,7 +49,7 @@ def test_columns_before_the_first_link_are_unchanged(
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
 def test_every_convention_describes_the_same_mechanism(convention: AngleConvention) -> None:
-    """Tip of a chain of unit links, from the definition of each convention and from joint angles."""
+    """Tip of a chain of unit links, from each convention's definition and from joint angles."""
     written = np.random.default_rng(1).uniform(-3, 3, (20, 3))
     absolute = np.cumsum(written, axis=1) if convention.angles == "relative" else written
     up = -1.0 if convention.measured_from == "hanging" else 1.0

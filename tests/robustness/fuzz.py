@@ -1,10 +1,10 @@
-"""Feed every loader damaged files: it must give something valid or refuse by a documented error.
+"""Feed damaged files to every loader: it must return something valid or raise a documented error.
 
-    python -m tests.robustness.fuzz --cases 100000 csv rig_json
+python -m tests.robustness.fuzz --cases 100000 csv rig_json
 
-Runs from the repository's root. Loaders run in a child process with a limit of memory, every case
-with a limit of time, so that a crash of a library and a hang are counted too. A case is told by
-its number alone: `--first 4711 --cases 1 --keep case.csv` writes and repeats one.
+Run from the repository's root. Loaders run in a child process with a memory limit, every case with
+a time limit, so that a crash of a library and a hang are counted too. A case is identified by its
+number alone: `--first 4711 --cases 1 --keep case.csv` writes and repeats one.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from tests.robustness.loaders import LOADERS, Loader
 SECONDS, MEMORY = 5.0, 2 * 2**30
 _STUCK = 600.0  # wall time without progress [s]; a busy machine may well take a minute
 _HARNESS = 77  # exit status of a child that failed outside a case
-_PERISHED = 78  # and of one that an error of a library ends, as it ends a process of its own
+_PERISHED = 78  # and of one that a library error ends, as it ends a process of its own
 _MEMORY_DISK = "/dev/shm" if Path("/dev/shm").is_dir() else None
-_COUNTS = struct.Struct("qqq")  # the case at work, how many were loaded, how many refused
+_COUNTS = struct.Struct("qqq")  # the current case, how many were loaded, how many refused
 
 
 class Hang(BaseException):
-    """A case took too long; no loader's own `except` should take it."""
+    """A case took too long; derived so that no loader's own `except` catches it."""
 
 
 @dataclass
