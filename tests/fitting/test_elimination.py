@@ -106,7 +106,7 @@ def grown(growth, factor, seed=0):
     """A window whose rows, without its state, have the triangular `factor`; both grow together.
 
     Returns:
-    Information about shared unknowns from its rows, and from their squares.
+        Information about shared unknowns from its rows, and from their squares.
     """
     g = torch.Generator().manual_seed(seed)
     shared, size = len(factor), len(factor) + STATE

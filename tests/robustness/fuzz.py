@@ -1,6 +1,6 @@
 """Feed damaged files to every loader: it must return something valid or raise a documented error.
 
-python -m tests.robustness.fuzz --cases 100000 csv rig_json
+    python -m tests.robustness.fuzz --cases 100000 csv rig_json
 
 Run from the repository's root. Loaders run in a child process with a memory limit, every case with
 a time limit, so that a crash of a library and a hang are counted too. A case is identified by its
@@ -49,13 +49,12 @@ class Hang(BaseException):
 
 @dataclass
 class Outcome:
-    """What became of the cases of a loader.
+    """Results of the cases of a loader.
 
     Attributes:
-        loaded, refused: how many gave something valid, and a documented error.
-        perished: of what the refused ones had ended or hung a process of their own.
-        faults: by kind, where all else came from: number of cases, and the first of them with its
-            traceback.
+        loaded, refused: number of cases that gave something valid, or a documented error.
+        perished: what ended or hung the worker processes of refused cases.
+        faults: all other cases by kind: their number, and the first of them with its traceback.
     """
 
     loader: str
@@ -94,18 +93,18 @@ def fuzz(
     """Run a loader over damaged files.
 
     Args:
-        name: of `LOADERS`.
-        cases: how many, numbered from `first`.
-        seconds: of processor time that a case may take; what waits is ended after ten minutes.
-        memory: that the loader may take besides what this process has [bytes].
-        budget: no case is begun after this time [s].
-        keep: write the last case's file there.
+        name: key of `LOADERS`.
+        cases: number of cases, counted from `first`.
+        seconds: processor time per case [s]; a case that only waits is ended after ten minutes.
+        memory: memory of the loader in addition to that of this process [bytes].
+        budget: no case is started after this time [s].
+        keep: path for the last case's file.
     """
     outcome, begin = Outcome(name), time.monotonic()
     work = _Work(LOADERS[name], first + cases, seconds, memory, begin + budget, keep)
     at = first
     while at < work.end and time.monotonic() < work.deadline:
-        # Made here, as a child that is ended leaves its files behind.
+        # Created here, because a terminated child leaves its files behind.
         with tempfile.TemporaryDirectory(dir=_MEMORY_DISK) as folder:
             at = _run_child(work, at, outcome, Path(folder)) + 1
     outcome.seconds = time.monotonic() - begin
@@ -114,7 +113,7 @@ def fuzz(
 
 @dataclass(frozen=True)
 class _Work:
-    """What a child is to do: cases up to `end`, none begun after the deadline."""
+    """Task of a child: cases up to `end`, none started after the deadline."""
 
     loader: Loader
     end: int
@@ -125,7 +124,7 @@ class _Work:
 
 
 def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
-    """Cases from `first` on until all are done or one ends the child; the last case tried."""
+    """Run cases from `first` until all are done or one ends the child; return the last one."""
     shared = mmap.mmap(-1, _COUNTS.size)
     shared[:] = _COUNTS.pack(first, 0, 0)
     reader, writer = os.pipe()
@@ -160,7 +159,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     if status and os.WIFEXITED(status) and os.waitstatus_to_exitcode(status) == _HARNESS:
         raise RuntimeError(f"{work.loader.name}: the harness itself failed, see above.")
     if status:
-        ended = "hang in a library" if hung else f"the process ended ({_told(status)})"
+        ended = "hang in a library" if hung else f"the process ended ({_cause(status)})"
         if work.loader.apart:
             outcome.perished[ended] += 1
             outcome.refused += 1
@@ -169,7 +168,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     return int(case)
 
 
-def _told(status: int) -> str:
+def _cause(status: int) -> str:
     if os.WIFSIGNALED(status):
         return signal.Signals(os.WTERMSIG(status)).name
     if os.waitstatus_to_exitcode(status) == _PERISHED:
@@ -178,22 +177,22 @@ def _told(status: int) -> str:
 
 
 def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path) -> NoReturn:
-    """Never returns; tells faults as lines of JSON."""
+    """Write faults as lines of JSON, and never return."""
     loader = work.loader
     status = _HARNESS
     try:
         tempfile.tempdir = str(folder)
-        faulthandler.disable()  # what ends it is told by the parent
+        faulthandler.disable()  # the parent reports what ends it
         with _quiet(), os.fdopen(writer, "w") as pipe:
             samples = loader.samples(folder)
             warm = folder / f"warm{loader.suffix}"
             for sample in samples:  # libraries are imported before memory is limited
                 warm.write_bytes(sample)
                 loader.load(warm)
-            # What an address space already holds is no loader's.
+            # Memory in use before does not count for the loader.
             held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (held + work.memory,) * 2)
-            # A process of its own may be ended, where Python cannot interrupt it as well.
+            # A separate process may be terminated, even if Python cannot interrupt it.
             signal.signal(signal.SIGPROF, signal.SIG_DFL if loader.apart else _too_long)
             counts = [0, 0]
             case = first
@@ -203,7 +202,7 @@ def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path
                 if fault is not None:
                     pipe.write(json.dumps(fault) + "\n")
                     pipe.flush()
-                # Behind the case: however slow the machine, one is tried.
+                # After the case, so that one is tried even on a slow machine.
                 if time.monotonic() > work.deadline:
                     break
             shared[:] = _COUNTS.pack(case, *counts)
@@ -217,7 +216,7 @@ def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path
 def _try(
     work: _Work, case: int, samples: Sequence[bytes], folder: Path, counts: list[int]
 ) -> tuple[str, int, str] | None:
-    """One case: counted, or told as kind, number and traceback."""
+    """Run one case, which is counted, or reported as kind, number and traceback."""
     loader = work.loader
     rng = Random(f"{loader.name} {case}")
     content = loader.damage(rng, rng.choice(samples))
@@ -240,7 +239,7 @@ def _try(
         return None
     except (Exception, Hang) as error:
         if loader.apart and not isinstance(error, AssertionError):
-            os._exit(_PERISHED)  # as it would end there; it may have spoilt this process, too
+            os._exit(_PERISHED)  # as in a worker; it may have damaged this process, too
         frames = [
             f for f in traceback.extract_tb(error.__traceback__) if "/nfriction/" in f.filename
         ]
@@ -262,13 +261,13 @@ def _too_long(_signal: int, _frame: FrameType | None) -> None:
 def _quiet() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # A loader that computes with nonsense before it looks at it.
+        # A loader that computes with invalid numbers before it checks them.
         warnings.filterwarnings("error", category=RuntimeWarning, module=r"nfriction\.")
         yield
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status 1 where there is a fault."""
+    """Return exit status 1 if there is a fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("loaders", nargs="*", metavar="LOADER", help=", ".join(LOADERS))
     parser.add_argument("--cases", type=int, default=100_000)

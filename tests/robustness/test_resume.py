@@ -32,7 +32,7 @@ if __name__ == "__main__":
     ), jobs=1)
 """
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-Told = Callable[[Path], None]
+Check = Callable[[Path], None]
 
 
 def begin(words: list[str]) -> "subprocess.Popen[str]":
@@ -59,13 +59,13 @@ def end(process: "subprocess.Popen[str]", how: int) -> str:
 
 
 def broken_off(
-    words: list[str], folder: Path, started: Path, seed: int, kills: int, check: Told
+    words: list[str], folder: Path, started: Path, seed: int, kills: int, check: Check
 ) -> None:
     """Run to the end with `kills` terminations at random moments from the seed.
 
     Args:
-    started: a file that exists as soon as the work has started.
-    check: what must be true of the folder after each termination.
+        started: a file that exists as soon as the work has started.
+        check: condition that must be true of the folder after each termination.
     """
     rng = Random(seed)
     for kill in range(kills):
