@@ -318,7 +318,7 @@ def test_change_is_detected_if_friction_dominates_the_torque(fall, constants):
 
 @pytest.mark.parametrize("drift", [0.0, 1.0, -1.0])
 def test_drifting_offset_of_a_force_sensor_is_named(drift):
-    """Of at most a twelfth of the friction."""
+    """The drift is at most a twelfth of the friction."""
     rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
     phase, rng = rate * time, np.random.default_rng(0)
     q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)

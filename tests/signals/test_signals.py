@@ -95,8 +95,7 @@ def test_causal_error_is_the_delay_of_the_filter(motion: str) -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_kalman_smoother_finds_a_good_bandwidth(motion: str) -> None:
-    """Without any knowledge of the motion it is about as good as the best of many Savitzky-Golay
-    windows."""
+    """Without knowledge of the motion it rivals the best of many Savitzky-Golay windows."""
     truth = MOTIONS[motion](UNIFORM)
     q = quantise(truth.q, COUNTS)
     tried = [savitzky_golay(truth.time, q, window) for window in np.arange(0.02, 0.2, 0.01)]

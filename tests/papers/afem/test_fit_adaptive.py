@@ -24,7 +24,7 @@ from nfriction.papers.afem.fit_adaptive import (
 from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
-from tests.fitting.test_trajectory import ABSOLUTE, point, windows
+from tests.fitting.test_shooting_problem import ABSOLUTE, point, windows
 
 V_SMOOTH = 0.05
 THRESHOLDS = [[30.0, 90.0], [60.0, 200.0]]

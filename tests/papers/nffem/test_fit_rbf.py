@@ -16,7 +16,7 @@ from nfriction.papers.nffem.fit_rbf import place_units
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.signals import Motion
 from tests.fitting.recordings import F64, pendulum
-from tests.fitting.test_trajectory import ABSOLUTE, windows
+from tests.fitting.test_shooting_problem import ABSOLUTE, windows
 
 Case = tuple[PendulumChain, Recording, FitResult]
 
