@@ -30,8 +30,8 @@ def compiler_effort(request: pytest.FixtureRequest) -> None:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the real recordings: `NFRICTION_DATA`, else `../shared/data`."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("NFRICTION_DATA", beside))
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("NFRICTION_DATA", default))
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}; set NFRICTION_DATA to run these tests")
     return folder
@@ -40,8 +40,8 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def reference_dir(request: pytest.FixtureRequest) -> Path:
     """Folder of exact plant states: `NFRICTION_REFERENCE`, else `../shared/reference`."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "reference"
-    folder = Path(os.environ.get("NFRICTION_REFERENCE", beside))
+    default = Path(__file__).resolve().parents[2] / "shared" / "reference"
+    folder = Path(os.environ.get("NFRICTION_REFERENCE", default))
     if not folder.is_dir():
         pytest.skip(f"no reference states at {folder}; set NFRICTION_REFERENCE to run these tests")
     return folder

@@ -272,7 +272,7 @@ def test_bad_arguments_raise_clear_errors(coulomb, change, message):
         run(compiled, **{**given, **change})
 
 
-class Remembering(Coulomb):
+class PathDependent(Coulomb):
     """Friction that grows with the distance travelled, one hidden state per joint."""
 
     state_size = 1
@@ -291,10 +291,10 @@ class Remembering(Coulomb):
 
 
 def test_hidden_state_agrees_with_eager_steps():
-    plant, friction = Pendulum(2), Remembering(2)
+    plant, friction = Pendulum(2), PathDependent(2)
     compiled = compile_rollout(plant, friction)
 
-    class Replayed(Coulomb):
+    class ReferencePathDependent(Coulomb):
         """The same friction for `reference`, which calls it once per step."""
 
         state = None
@@ -308,7 +308,7 @@ def test_hidden_state_agrees_with_eager_steps():
 
     q, qd = start(2, batch=2)
     got = run(compiled, q, qd, steps=1000, time_step=1e-3)
-    assert_same(got, reference(plant, Replayed(2), q, qd, 1000, 1e-3))
+    assert_same(got, reference(plant, ReferencePathDependent(2), q, qd, 1000, 1e-3))
     memory = torch.tensor([[[5.0], [1.0]], [[0.0], [9.0]]], dtype=F64)
     given = run(compiled, q, qd, steps=50, time_step=1e-3, memory=memory, threads=2)
     for i in range(2):

@@ -321,7 +321,7 @@ def scored(found: Comparison, limit: float | None = None, **errors: float) -> Co
     return dataclasses.replace(found, test=test)
 
 
-def judged(found: Comparison, **errors: float) -> str | None:
+def best_of(found: Comparison, **errors: float) -> str | None:
     """The best model of a comparison with these free-run errors."""
     return scored(found, **errors).best()
 
@@ -329,12 +329,12 @@ def judged(found: Comparison, **errors: float) -> str | None:
 def test_best_model_has_the_least_error_and_of_equals_is_the_simplest(comparison):
     found, _ = comparison
     assert found.to_dict()["best"]["model"] == found.best() == "LFM"
-    assert judged(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
-    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
-    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
-    assert judged(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
-    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
-    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
+    assert best_of(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
+    assert best_of(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
+    assert best_of(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
+    assert best_of(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
+    assert best_of(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
+    assert best_of(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
     alone = dataclasses.replace(found, test={})
     assert alone.best() is None
     assert alone.to_dict()["best"] is None
@@ -374,8 +374,8 @@ def test_models_within_the_limit_of_the_best_are_indistinguishable(comparison):
 def test_doubtful_model_is_not_best_if_a_good_one_is_no_worse(comparison):
     found, _ = comparison
     good = {n: dataclasses.replace(f, residual=0.0, converged=True) for n, f in found.fits.items()}
-    vague = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))
-    doubtful = dataclasses.replace(found, fits=Fits({**good, "LFM": vague}))
+    unidentifiable = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))
+    doubtful = dataclasses.replace(found, fits=Fits({**good, "LFM": unidentifiable}))
     assert [fit.usability[0] for fit in doubtful.fits.values()] == ["good", "doubtful"]
     near = scored(doubtful, 0.7, no_friction=5.0, NCFM=2.0, LFM=1.0)
     assert near.best() == "NCFM"

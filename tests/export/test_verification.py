@@ -115,11 +115,11 @@ def test_artefact_is_not_judged_by_its_own_scales(tmp_path: Path) -> None:
         pytest.skip("needs a C compiler")
     other = LFM(3, [1e-3, 2.1e-3])
     c(other, tmp_path, INFO, name="m")
-    beside = tmp_path / "m.contract.json"
-    content = json.loads(beside.read_text())
+    contract = tmp_path / "m.contract.json"
+    content = json.loads(contract.read_text())
     content["tolerance"] = 0.9
     content["scales"] = {name: [1e9] * len(x) for name, x in content["scales"].items()}
-    beside.write_text(json.dumps(content))
+    contract.write_text(json.dumps(content))
     verdict = verify_artefact(tmp_path / "m.c", LFM(3, [1e-3, 2e-3]), INFO, points=100)
     assert not verdict.points.passed
 
@@ -156,11 +156,11 @@ def test_altered_c_is_detected(tmp_path: Path) -> None:
     source.write_text("no C at all")
     with pytest.raises(ExportError, match="failed"):
         verify_artefact(source, MODELS["LFM"], INFO)
-    beside = tmp_path / "m.contract.json"
-    beside.write_text(beside.read_text()[:-100])
+    contract = tmp_path / "m.contract.json"
+    contract.write_text(contract.read_text()[:-100])
     with pytest.raises(ContractError, match="cut short"):
         verify_artefact(source, MODELS["LFM"], INFO)
-    beside.unlink()
+    contract.unlink()
     with pytest.raises(ContractError, match="not in the same folder"):
         verify_artefact(source, MODELS["LFM"], INFO)
 

@@ -152,8 +152,8 @@ def test_single_speed_makes_viscous_and_coulomb_unidentifiable():
     q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
     recording = Recording(out.time.numpy(), q, tau=tau, unit="m", name="steady")
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5, 1.0), fit_plant=False)
-    (lost,) = found.unidentifiable
-    assert set(lost.split(" with ")) == {"B of joint1", "C of joint1"}
+    (direction,) = found.unidentifiable
+    assert set(direction.split(" with ")) == {"B of joint1", "C of joint1"}
     assert any("Not identifiable" in warning for warning in found.warnings)
     assert all(i.high - i.low > i.value for i in found.intervals)
     viscous, coulomb = found.model.schedule.values[0].tolist()
@@ -417,8 +417,8 @@ def test_recordings_without_torque_among_driven_ones_are_named():
         assert len([w for w in caught if "no torque" in str(w.message)]) == 1
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="no torque is recorded")
-        for alike in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
-            fit(LFM(2), pendulum(), alike, method="equation_error")
+        for pair in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
+            fit(LFM(2), pendulum(), pair, method="equation_error")
 
 
 def test_plain_fit_logs_no_warnings(caplog):
@@ -507,7 +507,7 @@ POOR = [[3e-3, 0.0, 1e-4, 20.0, 2.0]] * 2
 
 
 @pytest.fixture
-def misled(monkeypatch):
+def misled_searches(monkeypatch):
     """Make the first equation-error fit of a law return useless coefficients."""
     asked = []
 
@@ -567,15 +567,15 @@ def mine(joints, **settings):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [Stribeck, mine])
-def test_misled_law_restarts_from_the_fitted_plant(misled, monkeypatch, law):
+def test_misled_law_restarts_from_the_fitted_plant(misled_searches, monkeypatch, law):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
 
     def fitted():
-        misled.clear()
+        misled_searches.clear()
         return fit(law(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
 
     found = fitted()
-    assert misled[1] is not misled[0]
+    assert misled_searches[1] is not misled_searches[0]
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
     better = "nfriction.fitting.strategy.continuation.restart_from_equation_error"
     monkeypatch.setattr(better, lambda fitter, found, *rest: found)
@@ -654,10 +654,10 @@ def test_interrupt_of_a_further_search_keeps_the_best_fit(last):
     assert found.residual < alone.residual
 
 
-def test_law_without_a_nested_law_is_searched_once(misled):
+def test_law_without_a_nested_law_is_searched_once(misled_searches):
     fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), swing(pendulum(), true_model(), seconds=1.0),
         windows=(0.5,), max_steps=1)  # fmt: skip
-    assert len(misled) == 1
+    assert len(misled_searches) == 1
 
 
 def test_coefficient_at_zero_is_reported_as_absent():

@@ -71,11 +71,11 @@ def test_every_window_is_a_hold_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.1, 100.0):
         hold_out = []
-        for seen, judged in splits(search, motions, length):
+        for train, hold_out_windows in splits(search, motions, length):
             # Several at a time, so that each lies between training windows.
-            assert len(judged) >= FOLDS
-            assert not set(seen.spans) & set(judged.spans)
-            hold_out += judged.spans
+            assert len(hold_out_windows) >= FOLDS
+            assert not set(train.spans) & set(hold_out_windows.spans)
+            hold_out += hold_out_windows.spans
         samples = [np.arange(first, last) for _, first, last in sorted(hold_out)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
 
@@ -108,8 +108,8 @@ def test_every_recording_is_a_hold_out_once(constant, count):
     joint, found = constant
     windows = holdout_windows([joint] * count, [*found.motions] * count, 0.5, FOLDS)
     held_out = []
-    for seen, judged in recording_splits(windows, FOLDS):
-        places = [{place for place, *_ in part.spans} for part in (seen, judged)]
+    for train, hold_out_windows in recording_splits(windows, FOLDS):
+        places = [{place for place, *_ in part.spans} for part in (train, hold_out_windows)]
         assert set.union(*places) == set(range(count))
         assert not set.intersection(*places)
         held_out += places[1]
@@ -124,17 +124,17 @@ def test_short_recording_with_a_gap_still_has_hold_out_windows(constant):
     assert len(gapped.segments) == 2
     motion = kalman_smoother(gapped.time, gapped.q)
     found = holdout_splits(holdout_windows([gapped], [motion], 100.0, FOLDS), FOLDS)
-    assert all(len(seen) >= 2 and len(hold_out) >= 1 for seen, hold_out in found)
+    assert all(len(train) >= 2 and len(hold_out) >= 1 for train, hold_out in found)
 
 
 def test_zero_network_has_its_laws_error_and_a_bad_one_a_larger(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, hold_out = splits(search, motions, 0.5)[0]
+    train, hold_out = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
-    of_law = rmse(hold_out, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
+    of_law = rmse(hold_out, law.problem(train, 1e-3, vector(law)), vector(law), NONE)
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         network = torch.full_like(vector(search), value)
-        by_network = search.problem(seen, 1e-3, network)
+        by_network = search.problem(train, 1e-3, network)
         assert least <= rmse(hold_out, by_network, network, NONE) / of_law <= most
     assert not vector(search).any()
 
@@ -142,9 +142,9 @@ def test_zero_network_has_its_laws_error_and_a_bad_one_a_larger(constant):
 def test_window_is_scored_from_the_state_that_fits_best(constant):
     """A smoother's error at the start is no error of the law."""
     search, motions = refinement(constant), constant[1].motions
-    seen, hold_out = splits(search, motions, 0.5, cut_for_folds)[0]
+    train, hold_out = splits(search, motions, 0.5, cut_for_folds)[0]
     law = replace(search, friction=constant[1].model)
-    problem = law.problem(seen, 1e-4, vector(law))
+    problem = law.problem(train, 1e-4, vector(law))
     off = replace(hold_out, q0=hold_out.q0 + 5e-3, qd0=hold_out.qd0 - 0.05)
     from_off = replace(problem, windows=off)
     unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
@@ -155,9 +155,9 @@ def test_window_is_scored_from_the_state_that_fits_best(constant):
 
 def test_diverging_network_has_infinite_error(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, hold_out = splits(search, motions, 0.5)[0]
+    train, hold_out = splits(search, motions, 0.5)[0]
     wild = torch.full_like(vector(search), 1e6)
-    assert rmse(hold_out, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
+    assert rmse(hold_out, search.problem(train, 1e-3, wild), wild, NONE) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -253,11 +253,11 @@ def test_fit_stopped_before_its_network_keeps_the_constant_law(constant):
 def test_interrupt_during_hold_out_keeps_the_constant_law(constant, monkeypatch):
     joint, found = constant
     cost = ShootingProblem.cost
-    judged = []
+    scored = []
 
     def interrupted(problem, x):
         if len(problem.windows) == hold_out:
-            judged.append(x)
+            scored.append(x)
             raise KeyboardInterrupt
         return cost(problem, x)
 
@@ -266,7 +266,7 @@ def test_interrupt_during_hold_out_keeps_the_constant_law(constant, monkeypatch)
     monkeypatch.setattr(ShootingProblem, "cost", interrupted)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
-    assert len(judged) == 1
+    assert len(scored) == 1
     assert torch.equal(*(m.schedule.parameter_vector() for m in (kept.model, model)))
     assert not kept.converged
     assert "Stopped" in kept.status

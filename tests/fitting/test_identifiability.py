@@ -58,10 +58,10 @@ def test_eliminating_window_states_marginalises_them():
 
 def test_diverged_windows_determine_nothing():
     """Their states are collinear to the last digit, and no solver separates them."""
-    grown = torch.tensor([1e15, 1.0, 1.0, 3.0], dtype=F64)
-    state = grown.outer(grown)
+    growth = torch.tensor([1e15, 1.0, 1.0, 3.0], dtype=F64)
+    state = growth.outer(growth)
     hessian = torch.block_diag(torch.eye(3, dtype=F64), state)
-    across = torch.linspace(1.0, 2.0, 12, dtype=F64).reshape(3, 4) * grown
+    across = torch.linspace(1.0, 2.0, 12, dtype=F64).reshape(3, 4) * growth
     hessian[:3, 3:], hessian[3:, :3] = across, across.T
     for score in (None, hessian):
         known = information(hessian, torch.ones(7, dtype=F64), 3, score)
@@ -90,12 +90,12 @@ def test_intervals_cover_with_heteroscedastic_residuals():
     sizes = torch.cat([torch.full((100,), 1.0), torch.full((100,), 0.1)]).to(F64)
     hessian, zero = design.T @ design, torch.zeros(3, dtype=F64)
     score = design.T @ (sizes[:, None] ** 2 * design)
-    alike = float(sizes.square().mean().sqrt())
+    pooled = float(sizes.square().mean().sqrt())
     free = torch.full((3,), torch.inf, dtype=F64)
-    hits: dict[str, list[bool]] = {"sandwich": [], "alike": []}
+    hits: dict[str, list[bool]] = {"sandwich": [], "pooled": []}
     sd = {
         "sandwich": standard_deviations(information(hessian, zero, 3, score)),
-        "alike": standard_deviations(information(hessian / alike**2, zero, 3)),
+        "pooled": standard_deviations(information(hessian / pooled**2, zero, 3)),
     }
     for _ in range(400):
         y = sizes * torch.randn(len(design), generator=g, dtype=F64)
@@ -106,7 +106,7 @@ def test_intervals_cover_with_heteroscedastic_residuals():
     covered = {name: sum(hit) / len(hit) for name, hit in hits.items()}
     # 1200 trials of 95 %: a standard deviation is 0.6 %.
     assert covered["sandwich"] == pytest.approx(0.95, abs=0.02)
-    assert covered["alike"] < 0.9
+    assert covered["pooled"] < 0.9
 
 
 def test_intervals_scale_with_units():
@@ -184,10 +184,10 @@ def test_warnings_appear_only_for_problems_and_name_them():
     none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
     assert none == "At zero: B, C; the data show no such effect."
     assert beyond == "At a bound: v_s; the data favour values beyond it."
-    (lost,) = warnings_of(
+    (warning,) = warnings_of(
         **good | {"at_bounds": ["B"], "unidentifiable": ["B of joint1"]}, at_zero=["B"]
     )
-    assert "Not identifiable" in lost
+    assert "Not identifiable" in warning
 
 
 def test_intervals_of_scales_are_multiplicative():

@@ -55,7 +55,7 @@ def swings(seconds, length, friction, start, recordings=1, **settings):
     return search, cut_windows(made, motions, length)
 
 
-def tame(stride=1, **settings) -> ShootingProblem:
+def regular_problem(stride=1, **settings) -> ShootingProblem:
     friction = [[2e-3, 3e-3], [1e-3, 2e-3]]
     search, windows = swings(0.6, 0.2, friction, (1.6, 0.8), recordings=2, **settings)
     start = search.friction.schedule.parameter_vector()
@@ -67,7 +67,7 @@ def error_sizes(p: ShootingProblem) -> torch.Tensor:
     return 2e-4 * (0.5 + torch.rand(p.windows.q.shape, generator=g, dtype=F64))
 
 
-def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
+def information_from_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
     """Normal equations of all unknowns, and those with the states marginalised."""
     rows = p.rows(p.simulate(x), p.scale * sd / p.noise_sd)
     covariance = normal_equations(rows, torch.zeros_like(sd), p.variables.indices(), len(x))[1]
@@ -78,10 +78,10 @@ def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Informa
 @pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=F64)])
 @pytest.mark.parametrize("stride", [1, 3])
 def test_rows_and_squares_agree_in_regular_motion(stride, offset_sd):
-    p = tame(stride, offset_sd=offset_sd)
+    p = regular_problem(stride, offset_sd=offset_sd)
     assert len(p.windows) == 6
     x, sd = p.variables.start(), error_sizes(p)
-    found, expected = gathered_information(p, x, sd), by_squares(p, x, sd)
+    found, expected = gathered_information(p, x, sd), information_from_squares(p, x, sd)
     torch.testing.assert_close(found.prior, expected.prior)
     for name in ("data", "score"):
         one, other = getattr(found, name), getattr(expected, name)
@@ -93,7 +93,7 @@ def test_rows_and_squares_agree_in_regular_motion(stride, offset_sd):
 
 @pytest.mark.parametrize("piece", [1, 50])
 def test_result_does_not_depend_on_the_chunks(piece, monkeypatch):
-    p = tame(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
+    p = regular_problem(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
     x, sd = p.variables.start(), error_sizes(p)
     whole = gathered_information(p, x, sd)
     monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
@@ -102,7 +102,7 @@ def test_result_does_not_depend_on_the_chunks(piece, monkeypatch):
     torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)
 
 
-def grown(growth, factor, seed=0):
+def window_with_growing_states(growth, factor, seed=0):
     """A window whose rows, without its state, have the triangular `factor`; both grow together.
 
     Returns:
@@ -133,7 +133,7 @@ def triangle(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_information_survives_growing_states(seed):
     factor = triangle(seed)
-    rows, squares = grown(1e12, factor, seed)
+    rows, squares = window_with_growing_states(1e12, factor, seed)
     assert null_directions(NAMES, rows) == ()
     # In units of the diagonal; rows are rounded to 1e-4 relative to information of 1e3.
     scale = (factor.T @ factor).diagonal().rsqrt()
@@ -148,12 +148,12 @@ def test_growing_states_add_no_spurious_information():
     for seed in range(10):
         factor = triangle(seed)
         factor[:, 1] = 2 * factor[:, 0]
-        rows, squares = grown(1e12, factor, seed)
+        rows, squares = window_with_growing_states(1e12, factor, seed)
         (direction,) = null_directions(NAMES, rows)
         assert set(direction.split(" with ")) == {"a", "b"}
         blind = 0 * factor
         blind[:, 1:] = triangle(seed)[:, 1:]
-        rows, squares = grown(1e12, blind, seed)
+        rows, squares = window_with_growing_states(1e12, blind, seed)
         assert null_directions(NAMES, rows) == ("a",)
         wrong += float(squares.data[0, 0]) > 1e6
     # Of the round-off of large squares about half is positive.
@@ -163,7 +163,7 @@ def test_growing_states_add_no_spurious_information():
 @pytest.mark.parametrize("growth", [1e20, 1e25])
 def test_round_off_of_rows_adds_no_information(growth):
     """Beyond the precision of rows, all information is lost, and round-off is not taken for any."""
-    rows, _ = grown(growth, triangle(0))
+    rows, _ = window_with_growing_states(growth, triangle(0))
     directions = " with ".join(null_directions(NAMES, rows))
     assert set(directions.split(" with ")) == set(NAMES[:SHARED])
 
@@ -175,7 +175,7 @@ def test_lost_directions_do_not_make_others_overconfident(growth):
     kept = too_sure = 0
     for seed in range(60):
         factor = triangle(seed)
-        rows, _ = grown(growth, factor, seed)
+        rows, _ = window_with_growing_states(growth, factor, seed)
         exact = standard_deviations(Information(factor.T @ factor, torch.zeros(SHARED, dtype=F64)))
         share = standard_deviations(rows) / exact
         kept += int(share.isfinite().sum())
@@ -221,7 +221,7 @@ def test_chaotic_window_keeps_its_information():
     index = fitted.nonzero().flatten()
     sd = torch.full_like(errors, p.noise_sd)
     gathered = gathered_information(p, x, sd).subset(index)
-    squares = by_squares(p, x, sd).subset(index)
+    squares = information_from_squares(p, x, sd).subset(index)
     expected = torch.as_tensor(exact)[fitted][:, fitted]
     scale = expected.diagonal().rsqrt()
 
