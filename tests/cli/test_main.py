@@ -32,7 +32,7 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
     return block.replace("\\\n", " ").split()
 
 
-def test_console_shows_each_kind_of_message_once() -> None:
+def test_a_console_shows_each_kind_of_message_once() -> None:
     new = FirstOfItsKind()
     given = [
         ("%d rollout(s) diverged", 3), ("%d rollout(s) diverged", 4), ("%s failed: no data", "LFM"),
@@ -191,7 +191,7 @@ def test_export_info_and_demo_refuse_unsupported_requests(
         pytest.param(["info"], "", marks=pytest.mark.slow),
     ],
 )
-def test_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path: Path) -> None:
+def test_a_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path: Path) -> None:
     if words == ["info"]:
         save(NCFM(2), tmp_path / "NCFM.json")
         words = ["info", str(tmp_path / "NCFM.json")]

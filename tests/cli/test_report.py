@@ -9,7 +9,7 @@ from nfriction.friction import both_names
 from tests.cli.benches import compare, results
 
 
-def test_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> None:
+def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "pages" / "mine.html"
     assert cli.main(["report", str(compared), "--out", str(out)]) == 0
     assert capsys.readouterr().out == f"wrote {out}\n"

@@ -21,7 +21,7 @@ def csv(tmp_path: Path) -> Path:
     return path
 
 
-def test_table_is_fitted_scored_and_exported(
+def test_a_table_is_fitted_scored_and_exported(
     csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"

@@ -166,7 +166,7 @@ def test_direction_without_training_data_is_named():
         compare(Rotor(0.02), "NCFM", *parts, horizons=(0.5,), windows=(0.5,), max_steps=1)
 
 
-def test_mistake_in_a_test_recording_is_named(recwarn):
+def test_a_mistake_in_a_test_recording_is_named(recwarn):
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
     compare(pendulum(), "NCFM", A, B, **settings)
     assert not [w for w in recwarn if "likely" in str(w.message) or "unit" in str(w.message)]
@@ -192,7 +192,7 @@ def test_mistake_in_a_test_recording_is_named(recwarn):
         ({}, ""),
     ],
 )
-def test_test_recording_that_differs_from_training_is_named(recwarn, change, text):
+def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, text):
     axis, recordings = LinearAxis(2.0), []
     for name in ("train", "test"):
         own = change if name == "test" else {}
@@ -371,7 +371,7 @@ def test_models_within_the_limit_of_the_best_are_indistinguishable(comparison):
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
 
 
-def test_doubtful_model_is_not_best_if_a_good_one_is_no_worse(comparison):
+def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     found, _ = comparison
     good = {n: dataclasses.replace(f, residual=0.0, converged=True) for n, f in found.fits.items()}
     unidentifiable = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))

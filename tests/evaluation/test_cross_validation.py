@@ -77,7 +77,7 @@ def by_torque(model, plant, recordings, *, motions, start, **_):
     return fit(model, plant, recordings, motions=motions, method="equation_error")
 
 
-def test_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
+def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
     def fragile(model, *args, motions, **settings):
         if isinstance(model, LFM) and motions[0].time[0] > 0:
             raise ValueError("nothing to be learnt")

@@ -198,7 +198,7 @@ def other(comparison: Comparison) -> Comparison:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that share what was fitted")
 @pytest.mark.usefixtures("quick_scripts")
-def test_kill_at_any_moment_never_mixes_two_runs(
+def test_a_kill_at_any_moment_never_mixes_two_runs(
     comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     def write(made: Comparison, folder: Path) -> str:
@@ -309,7 +309,7 @@ def test_concurrent_writes_to_one_folder_are_refused(
 
 
 @pytest.mark.usefixtures("quick_scripts")
-def test_report_of_two_runs_is_refused(
+def test_a_report_of_two_runs_is_refused(
     comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     one, two = tmp_path / "one", tmp_path / "two"

@@ -293,7 +293,7 @@ def test_demo_output_matches_the_readme(
     shutil.which("mkdocs", path=Path(sys.executable).parent) is None,
     reason="no mkdocs here; `pip install .[docs]` to run this",
 )
-def test_site_builds_and_needs_no_network(tmp_path: Path) -> None:
+def test_the_site_builds_and_needs_no_network(tmp_path: Path) -> None:
     command = [str(Path(sys.executable).parent / "mkdocs"), "build", "--strict", "-d", tmp_path]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=300)
     for page in tmp_path.rglob("*.html"):

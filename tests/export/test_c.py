@@ -221,7 +221,7 @@ def test_status_reports_clamping_and_saturation(exported):
 
 @cases
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
-def test_filter_runs_inside(exported, name, dtype):
+def test_the_filter_runs_inside(exported, name, dtype):
     _, controller, folder = exported(name, dtype, with_filter=True)
     build([*C89, "-c", "nfriction.c", "-o", "n.o"], folder)
     build([*CXX, "-fsyntax-only", "-x", "c++", "nfriction.c"], folder)
@@ -293,7 +293,7 @@ def test_two_controllers_live_in_one_program(tmp_path):
         np.testing.assert_allclose([float(x) for x in output.split()], expected, rtol=1e-13)
 
 
-def test_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
+def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
     c(Gear(2), tmp_path, ModelInfo(sample_time=1e-3))
     head = (tmp_path / "nfriction.ino").read_text().partition("extern")[0]
     assert "write `read_position`, `read_torque` and `write_torque` for your board" in head
@@ -320,7 +320,7 @@ def test_sketch_starts_at_rest_from_any_position(tmp_path, with_filter):
 
 
 @pytest.mark.parametrize(("law", "period"), [("LFM", "INHERITED_SAMPLE_TIME"), ("LuGre", "0.004")])
-def test_s_function_of_a_hidden_state_has_its_sample_time(tmp_path, law, period):
+def test_the_s_function_of_a_hidden_state_has_its_sample_time(tmp_path, law, period):
     c(model_by_name(law)(2), tmp_path, ModelInfo(sample_time=0.004))
     assert f"ssSetSampleTime(S, 0, {period})" in (tmp_path / "nfriction_sfun.c").read_text()
 

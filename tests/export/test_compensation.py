@@ -49,7 +49,7 @@ def test_high_gain_on_measured_velocity_causes_motion_at_rest(shown: Rows) -> No
     assert shown["measured", "1.3"][1] > 20 * shown["desired", "1.3"][1]
 
 
-def test_guide_shows_these_numbers(shown: Rows) -> None:
+def test_the_guide_shows_these_numbers(shown: Rows) -> None:
     written = rows(GUIDE.read_text(encoding="utf-8"))
     assert written.keys() == shown.keys()
     for key, (error, *_) in shown.items():

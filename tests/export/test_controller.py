@@ -145,7 +145,7 @@ def test_filter_equals_that_of_signals_on_differences() -> None:
 
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
 @pytest.mark.parametrize("lost", [1, 100])
-def test_filter_survives_lost_samples(name: str, lost: int) -> None:
+def test_the_filter_survives_lost_samples(name: str, lost: int) -> None:
     """At a constant velocity, which is the same before and after the gap."""
     controller = controller_of(MODELS[name], INFO, with_filter=True)
     assert controller.inputs == ("q", "load")

@@ -115,7 +115,7 @@ def test_programs_do_not_depend_on_earlier_exports(tmp_path: Path) -> None:
         ("metadata", {"source_fn_stack": f"x,{ATTACK}"}),
     ],
 )
-def test_program_that_torch_would_run_as_python_is_refused(
+def test_a_program_that_torch_would_run_as_python_is_refused(
     artefacts: dict[str, Path], key: str, to: Any, tmp_path: Path
 ) -> None:
     files = files_of(artefacts[".pt2"])

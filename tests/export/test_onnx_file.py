@@ -104,7 +104,7 @@ def test_without_onnx_runtime_the_reference_evaluator_is_used(
 
 
 @needs_onnx
-def test_arctangent_is_double_everywhere(tmp_path: Path) -> None:
+def test_the_arctangent_is_double_everywhere(tmp_path: Path) -> None:
     law = Law("arctangent", (Coefficient("a", "N m"),), arctangent)
     model = FrictionModel(law, Constant(law, 1, [1.0]))
     run = runner_of(onnx(model, tmp_path / "m.onnx"), controller_of(model))

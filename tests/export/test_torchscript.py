@@ -222,7 +222,7 @@ def training_only(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: floa
     return coefficients.select(-1, 0) * qd
 
 
-def test_artefact_that_differs_from_its_model_is_not_written(tmp_path: Path) -> None:
+def test_an_artefact_that_differs_from_its_model_is_not_written(tmp_path: Path) -> None:
     path = torchscript(LFM(2), tmp_path / "model.pt")
     before = path.read_bytes()
     model = FrictionModel(law(training_only), Constant(law(training_only), 2))
@@ -237,7 +237,7 @@ def test_joint_names_must_match_the_number_of_joints(tmp_path: Path) -> None:
         torchscript(LFM(2), tmp_path / "model.pt", ModelInfo(joint_names=["a"]))
 
 
-def test_impossible_path_is_named(tmp_path: Path) -> None:
+def test_an_impossible_path_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"cannot write the file .*model\.pt"):
         torchscript(LFM(2), tmp_path / "file" / "model.pt")

@@ -110,7 +110,7 @@ def test_torque_error_is_found_despite_a_coefficient_near_zero() -> None:
         assert not verify(run, contract).passed, name
 
 
-def test_artefact_is_not_judged_by_its_own_scales(tmp_path: Path) -> None:
+def test_an_artefact_is_not_judged_by_its_own_scales(tmp_path: Path) -> None:
     if find_compiler() is None:
         pytest.skip("needs a C compiler")
     other = LFM(3, [1e-3, 2.1e-3])
@@ -138,7 +138,7 @@ def test_artefact_of_another_model_is_detected(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
-def test_artefact_of_another_law_is_refused(tmp_path: Path) -> None:
+def test_an_artefact_of_another_law_is_refused(tmp_path: Path) -> None:
     c(LFM(3), tmp_path, name="m")
     with pytest.raises(ContractError, match="the artefact gives shapes"):
         verify_artefact(tmp_path / "m.c", NFNLFM(3), points=50)

@@ -84,7 +84,7 @@ def test_resolution_that_differs_between_recordings_is_named():
     ]
 
 
-def test_joint_that_moves_in_one_recording_is_not_named():
+def test_a_joint_that_moves_in_one_recording_is_not_named():
     plant, rest = resting(0)
     moving = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging")
     assert data_warnings_of(plant, rest, moving) == ()

@@ -108,7 +108,7 @@ def test_torques_between_samples_are_interpolated_and_held_at_the_ends():
     assert not Recording(time, np.zeros((8, 2)), unit="m").torque_at(time[:3]).any()
 
 
-def test_delay_needs_torques_and_simulated_windows():
+def test_a_delay_needs_torques_and_simulated_windows():
     plant = pendulum()
     with pytest.raises(ValueError, match="needs recordings with torques"):
         fit(CVFM(2), plant, swing(plant, CVFM(2)), fit_delay=True)

@@ -100,7 +100,7 @@ def test_reversed_motor_is_named():
     assert "the signs of joint2's position and torque are reversed" in found
 
 
-def test_wrong_gear_ratio_of_a_motor_is_named():
+def test_a_wrong_gear_ratio_of_a_motor_is_named():
     """In angle and torque at once, which no other cause scales in this way."""
     _, q, tau = measured("driven")
     geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 40.0], torque_constant=0.1))
@@ -286,7 +286,7 @@ def test_short_recording_is_not_tested_for_play(samples):
 
 
 @pytest.mark.parametrize("change", [0.3, -0.3])
-def test_friction_that_changes_within_a_recording_is_named(change):
+def test_a_friction_that_changes_within_a_recording_is_named(change):
     warned = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
     named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in warned]
     ((way, found, within),) = (match.groups() for match in named if match)
@@ -421,7 +421,7 @@ def test_mistake_is_named_at_a_high_sample_rate_too():
     assert any("sign" in w for w in warnings_of(plant, q, -tau, time=time))
 
 
-def test_torque_held_for_long_steps_is_no_delay():
+def test_a_torque_held_for_long_steps_is_no_delay():
     plant, step = PendulumChain(**DOUBLE | {"inertia": [0.005, 0.002]}), 4e-3
     rng = np.random.default_rng(0)
     time, joints = step * np.arange(501), 2
@@ -620,7 +620,7 @@ def test_wrapped_angles_are_not_taken_for_an_elastic_joint():
     assert "likely: positions of a recording are wrapped (unwrap them" in first
 
 
-def test_inertia_that_the_fit_corrects_is_no_mistake():
+def test_an_inertia_that_the_fit_corrects_is_no_mistake():
     plant, q, tau = measured("wheel")
     less = 0.93 * plant.inertia_coupling
     assert warnings_of(plant.replace(inertia_coupling=less), q, tau) == ()
@@ -645,7 +645,7 @@ def test_mistakes_in_conventions_and_time_are_named(name):
 
 
 @pytest.mark.parametrize("name", ["free", pytest.param("driven", marks=pytest.mark.slow)])
-def test_wrong_sample_rate_is_named(name):
+def test_a_wrong_sample_rate_is_named(name):
     plant, q, tau = measured(name)
     (text,) = warnings_of(plant, q, tau, time=2.5 * STEP * np.arange(len(q)))
     assert "likely: the true sample rate is 2.5 times that in `time`" in text
@@ -689,14 +689,14 @@ def test_advanced_torque_is_aligned_again():
 
 
 @pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
-def test_driven_motion_without_torque_is_named(name):
+def test_a_driven_motion_without_torque_is_named(name):
     plant, q, _ = measured(name)
     (found, *_) = warnings_of(plant, q, None)
     assert "has no torque, but its motion gains energy up to" in found
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_swing_that_gains_little_energy_is_named(backwards):
+def test_a_swing_that_gains_little_energy_is_named(backwards):
     """The torque balance is too coarse for weak friction; a fit is not."""
     swung = swing(pendulum(), CVFM(2, [[1e-3, 2e-4], [4e-4, 1e-4]]).requires_grad_(False))
     q = np.pi / 1024 * np.round(swung.q * 1024 / np.pi)
@@ -717,7 +717,7 @@ def of_motor(plant: Plant, tau: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("off", [slice(SAMPLES // 2, None), slice(SAMPLES // 3, 2 * SAMPLES // 3)])
-def test_drive_that_is_off_for_a_while_is_named(off):
+def test_a_drive_that_is_off_for_a_while_is_named(off):
     """An emergency stop, for example, after which the log contains the command."""
     plant, _, commanded = measured("motor")
     driven = commanded.copy()
@@ -841,7 +841,7 @@ def of_several_days(rig: Plant, friction: list[float]) -> list[Recording]:
 
 
 @pytest.mark.parametrize("zero", ["upright", "hanging"])
-def test_recording_of_another_rig_is_named(zero):
+def test_a_recording_of_another_rig_is_named(zero):
     """Also if all encoders read zero at first, and may have been zeroed in any pose."""
     plant = measured("motor")[0]
     recordings = of_several_days(plant.replace(gravity_moment=2 * plant.gravity_moment), [0.8, 0.3])
@@ -943,7 +943,7 @@ def test_drive_offset_may_look_like_an_encoder_offset():
 
 
 @pytest.mark.parametrize("rounded", [True, False])
-def test_spike_is_named_with_its_time(rounded):
+def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")
     # Also without visible counts.
     q = q.copy() if rounded else kalman_smoother(STEP * np.arange(len(q)), q).q.copy()
@@ -997,7 +997,7 @@ def test_torque_scale_is_named_despite_errors_of_the_rig(scale, inertia, named):
         assert found.usability[0] == "doubtful"
 
 
-def test_step_at_a_gap_is_no_spike():
+def test_a_step_at_a_gap_is_no_spike():
     plant, q, tau = measured("driven")
     kept = np.r_[0:1000, 1600 : len(q)]
     with pytest.warns(UserWarning, match="gaps"):
@@ -1033,7 +1033,7 @@ def test_samples_missing_with_their_time_stamps_are_no_jump(missing):
     assert not any("jumps" in warning for warning in found)
 
 
-def test_fit_names_the_mistake_first(caplog):
+def test_a_fit_names_the_mistake_first(caplog):
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")
     prepare_task(CVFM(1), plant, recording, FitOptions())
@@ -1309,13 +1309,13 @@ def test_clipped_or_stuck_torque_sensor_is_named():
     assert not named(stuck)
 
 
-def test_unbalanced_rotor_is_named():
+def test_an_unbalanced_rotor_is_named():
     plant, q, tau = measured("wheel")
     first = warnings_of(plant, q, tau + 0.4 * np.sin(q - 0.5))[0]
     assert "likely: joint1 has an unbalanced mass that the rig lacks (`mass` and `com`)." in first
 
 
-def test_wrong_unit_is_listed_once():
+def test_a_wrong_unit_is_listed_once():
     assert [text for text, _ in diagnosis._corrected_rigs(LinearAxis(2.0), True)] == [
         "masses are in g"
     ]

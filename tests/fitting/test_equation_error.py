@@ -212,7 +212,7 @@ def test_fixed_coefficients_keep_the_values_of_the_model():
         (lambda qd, c: c[..., 0] * qd.sum(-1, keepdim=True), "depend on the first joint"),
     ],
 )  # fmt: skip
-def test_law_that_is_not_elementwise_is_refused_by_name(torque, message):
+def test_a_law_that_is_not_elementwise_is_refused_by_name(torque, message):
     def law(qd, load, coefficients, v_smooth):
         return torque(qd, coefficients)
 

@@ -106,7 +106,7 @@ def test_driven_axis_determines_mass_and_offset():
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
 
 
-def test_constant_force_is_the_offset_of_a_law_that_has_one():
+def test_a_constant_force_is_the_offset_of_a_law_that_has_one():
     """With a plant term as well, only their sum would be identifiable."""
     truth = LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)
     recording = driven_axis(LinearAxis(2.0, torque_offset=0.3), truth)

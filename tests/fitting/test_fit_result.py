@@ -24,7 +24,7 @@ def found() -> FitResult:
     return fit(LFM(1, v_smooth=0.01), AXIS, recording, method="equation_error", fit_plant=False)
 
 
-def test_table_has_every_coefficient_with_its_interval(found: FitResult) -> None:
+def test_the_table_has_every_coefficient_with_its_interval(found: FitResult) -> None:
     table = found.to_pandas()
     joint = AXIS.joint_names[0]
     assert list(table.index) == [f"B of {joint}", f"C of {joint}"]
@@ -83,7 +83,7 @@ def test_motion_dependent_coefficients_name_their_reference_motion(
     assert result.plot().axes
 
 
-def test_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
+def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
     summary = replace(found, warnings=("Too short: 1 < 2.",)).summary()
     assert summary.startswith("load-coulomb (LFM): good. Converged")
     assert " mN RMS" in summary
@@ -92,14 +92,14 @@ def test_summary_names_model_status_numbers_and_warnings(found: FitResult) -> No
     assert all(line == line.rstrip() for line in summary.splitlines())
 
 
-def test_result_is_printed_in_two_lines(found: FitResult) -> None:
+def test_a_result_is_printed_in_two_lines(found: FitResult) -> None:
     head, warned = repr(replace(found, warnings=("Too short: 1 < 2.",))).splitlines()
     assert head.startswith("FitResult of load-coulomb (LFM): good. Converged")
     assert warned == "Warnings: 1; see `summary()`."
     assert str(found) == repr(found)
 
 
-def test_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
+def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
     page = replace(found, warnings=("Too short: 1 < 2.",))._repr_html_()
     assert "load-coulomb (LFM): good" in page
     assert "<table" in page

@@ -230,7 +230,7 @@ def test_law_fitted_to_other_recordings_is_refitted(constant):
     assert len(kept.residuals) < len(found.residuals)
 
 
-def test_fit_stopped_before_its_network_keeps_the_constant_law(constant):
+def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
     joint, found = constant
     stages = []
 

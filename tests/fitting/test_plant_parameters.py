@@ -91,7 +91,7 @@ def test_drive_of_an_axis_may_carry_its_weight():
     assert found.model.schedule.values[0].tolist() == pytest.approx([1.0, 3.0], rel=0.05)
 
 
-def test_arm_has_no_hanging_position_and_no_encoder_terms():
+def test_an_arm_has_no_hanging_position_and_no_encoder_terms():
     links = [n for n in names(rigs.tlrip("free"), driven=(), eccentricity="on") if "enc" in n]
     assert links == [f"encoder {part} {j} [rad]" for j in (2, 3, 4) for part in ("cosine", "sine")]
 
@@ -168,7 +168,7 @@ def test_buffers_are_nominal_at_zero_and_ratios_multiply():
     torch.testing.assert_close(changed["torque_offset"], torch.tensor([0.0, 0.3], dtype=F64))
 
 
-def test_batch_of_vectors_gives_a_batch_of_plants():
+def test_a_batch_of_vectors_gives_a_batch_of_plants():
     plant = pendulum()
     terms = plant_parameters(plant, driven=())
     vectors = 0.05 * torch.randn(

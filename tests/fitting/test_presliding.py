@@ -161,7 +161,7 @@ def test_presliding_and_sliding_determine_all_coefficients(short) -> None:
     assert not found.unidentifiable
 
 
-def test_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> None:
+def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> None:
     recording, found = short
     errors = score(found.plant, found.model, recording, limit=False)
     assert errors.free_run.all < 1e-3

@@ -71,7 +71,7 @@ def test_final_rest_of_a_recording_is_in_no_window(noise):
         assert w.spans[-1][2] == pytest.approx(last, abs=2)
 
 
-def test_rest_away_from_equilibrium_does_not_bias_friction():
+def test_rest_away_from_the_equilibrium_does_not_bias_the_friction():
     """It creeps under a smoothed sign, which more friction would reduce."""
     plant = PendulumChain([0.5], [0.4], com=[0.2], inertia=[0.004])
     truth = CVFM(1, [[0.04, 0.0008]]).requires_grad_(False)
@@ -162,7 +162,7 @@ def test_windows_do_not_span_gaps(length):
 
 
 @pytest.mark.parametrize("held", [0.1, 1.0])
-def test_free_motion_is_used_from_its_release(held):
+def test_a_free_motion_is_used_from_its_release(held):
     """Before it, a hand holds the link: friction cannot hold a link that moves later."""
     plant = one_link()
     whole = swing(plant, CVFM(1, [5e-3, 1e-3]), seconds=2.0)
@@ -213,7 +213,7 @@ def test_figures_and_estimators_accept_a_hold_before_the_release(tmp_path):
 
 
 @pytest.mark.parametrize("start", [1e-3, 1e-2])
-def test_slow_start_near_upright_is_no_hold(start):
+def test_a_slow_start_near_upright_is_no_hold(start):
     slow = swing(one_link(), CVFM(1, [1e-6, 1e-4]), seconds=4.0, start=(start,))
     assert released([slow])[0] is slow
 

@@ -149,7 +149,7 @@ def test_model_file_keeps_the_heat_settings(tmp_path) -> None:
     assert torch.equal(again.schedule.states(qd, qdd), model.schedule.states(qd, qdd))
 
 
-def test_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
+def test_a_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
     model = warming_network()
     model.schedule.log_heat_capacity.fill_(-800.0)
     with pytest.raises(ModelFileError, match="a torque that is not finite"):
@@ -171,7 +171,7 @@ def test_initial_values_of_heat_coefficients_may_be_omitted() -> None:
         NFCVFM(2, [0.1], inputs=["heat"])
 
 
-def test_capacity_for_another_number_of_joints_is_refused() -> None:
+def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
     with pytest.raises(ValueError, match=r"1 number or 2, got shape \(3,\)"):
         warming().schedule.set_heat([1.0, 2.0, 3.0], 1.0, 1.0)
 

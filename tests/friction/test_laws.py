@@ -58,7 +58,7 @@ def test_friction_without_an_offset_is_odd(law: Law) -> None:
     assert torch.equal(law.torque(-qd, load, coefficients, V_SMOOTH), -forth)
 
 
-def test_offset_is_the_torque_at_rest() -> None:
+def test_the_offset_is_the_torque_at_rest() -> None:
     coefficients = torch.tensor([0.3, 0.1, 0.1, 0.1, 1.0], dtype=torch.float64)
     zero = torch.zeros((), dtype=torch.float64)
     assert nonlinear(zero, zero, coefficients, V_SMOOTH) == 0.3
@@ -214,6 +214,6 @@ def test_copies_of_a_model_share_its_law() -> None:
     assert again.schedule.raw is not model.schedule.raw
 
 
-def test_law_needs_a_function() -> None:
+def test_a_law_needs_a_function() -> None:
     with pytest.raises(TypeError, match="`torque` of law 'odd' must be a function, got None"):
         Law("odd", (Coefficient("B", "N m"),), None)  # type: ignore[arg-type]

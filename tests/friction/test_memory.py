@@ -148,7 +148,7 @@ def test_constant_velocity_within_a_sample_is_solved_exactly(law: Law, qd: float
 
 
 @every_law
-def test_joint_at_rest_keeps_its_state(law: Law) -> None:
+def test_a_joint_at_rest_keeps_its_state(law: Law) -> None:
     c = typical(law)
     state = torch.full((1, law.state_size), 3e-6, dtype=torch.float64)
     assert torch.equal(held(law, state, 0.0, 10.0, c), state)
@@ -194,7 +194,7 @@ def test_closed_inner_loops_return_to_the_point_they_left() -> None:
 
 
 @every_law
-def test_stiff_contact_is_stable_at_a_millisecond(law: Law) -> None:
+def test_a_stiff_contact_is_stable_at_a_millisecond(law: Law) -> None:
     # An explicit step has an amplification of sigma_0 |qd| dt / g, here 500.
     c, dt = typical(law), 1e-3
     t = torch.arange(2000, dtype=torch.float64) * dt

@@ -18,7 +18,7 @@ every_model = pytest.mark.parametrize("name", named_models())
 
 
 @every_model
-def test_torque_is_the_law_of_the_coefficients(name: str) -> None:
+def test_the_torque_is_the_law_of_the_coefficients(name: str) -> None:
     model = named_models()[name]
     qd, qdd, load = motion(20, 3)
     coefficients = model.coefficients(qd, qdd)
@@ -208,7 +208,7 @@ def test_v_smooth_must_be_positive(v_smooth: float) -> None:
         LFM(1, v_smooth=v_smooth)
 
 
-def test_schedule_for_another_law_is_refused() -> None:
+def test_a_schedule_for_another_law_is_refused() -> None:
     with pytest.raises(ValueError, match="the schedule gives C_p, but the law 'linear' takes B, C"):
         FrictionModel(LINEAR, Constant(VISCOUS, 2))
 
@@ -299,7 +299,7 @@ def test_values_that_are_no_numbers_are_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("terms", [5, None, "55"])
-def test_network_has_two_inputs(terms: object) -> None:
+def test_the_network_has_two_inputs(terms: object) -> None:
     with pytest.raises(ValueError, match="`terms` must be two whole numbers"):
         NFLFM(1, terms=terms)
 

@@ -41,7 +41,7 @@ def test_untrained_network_equals_the_constant_law(law) -> None:
     torch.testing.assert_close(schedule.reference_coefficients(), constant.values)
 
 
-def test_coefficient_near_zero_can_rise() -> None:
+def test_a_coefficient_near_zero_can_rise() -> None:
     schedule = NeuroFuzzy(LINEAR, 1)
     scale = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
     schedule.set_reference(torch.tensor([[0.0, 0.5]], dtype=torch.float64), scale)
@@ -50,7 +50,7 @@ def test_coefficient_near_zero_can_rise() -> None:
     assert torch.equal(schedule.scale, scale)
 
 
-def test_signed_coefficient_of_zero_starts_at_zero() -> None:
+def test_a_signed_coefficient_of_zero_starts_at_zero() -> None:
     schedule = NeuroFuzzy(NONLINEAR, 2)
     assert not schedule(*motion(5, 2)[:2])[..., 0].any()
 
@@ -138,7 +138,7 @@ def test_nearest_trained_motion_is_found(acceleration: str) -> None:
     ("velocity", "acceleration"),
     [(0.0, [-1, 1]), (1.0, [1, 1]), (float("nan"), [-1, 1]), (1.0, [-float("inf"), 1])],
 )
-def test_empty_range_is_refused(velocity: float, acceleration: list[float]) -> None:
+def test_an_empty_range_is_refused(velocity: float, acceleration: list[float]) -> None:
     schedule = NeuroFuzzy(LINEAR, 2)
     before = schedule.velocity_range.clone()
     with pytest.raises(ValueError, match="finite and not empty"):

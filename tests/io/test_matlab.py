@@ -137,7 +137,7 @@ def test_every_numeric_type_is_read(tmp_path: Path) -> None:
         }  # fmt: skip
 
 
-def test_other_byte_order_is_read(tmp_path: Path) -> None:
+def test_the_other_byte_order_is_read(tmp_path: Path) -> None:
     body = b"".join(
         struct.pack(">II", kind, len(content)) + content + bytes(-len(content) % 8)
         for kind, content in (

@@ -113,7 +113,7 @@ def test_model_info_round_trip_is_exact(tmp_path: Path) -> None:
     assert load_info(save(model, path)) == ModelInfo(joint_names=[])
 
 
-def test_model_is_scored_from_its_file_alone(tmp_path: Path) -> None:
+def test_a_model_is_scored_from_its_file_alone(tmp_path: Path) -> None:
     """The fitted mechanism is restored bit for bit, hence every simulated sample, too."""
     given = pendulum(convention=("absolute", "hanging"), position_quantum=1e-4)
     plant = given.replace(gravity_moment=1.03 * given.gravity_moment)
@@ -266,7 +266,7 @@ def numbers(content: dict[str, Any], key: str) -> list:
         lambda c: c.update(checksum="0" * 64),
     ],
 )
-def test_edited_file_is_refused(edit: Callable[[dict], None], tmp_path: Path) -> None:
+def test_an_edited_file_is_refused(edit: Callable[[dict], None], tmp_path: Path) -> None:
     _, path = small(tmp_path)
     content = json.loads(path.read_bytes())
     edit(content)
@@ -399,7 +399,7 @@ def nested(depth: int) -> list:
 
 
 @pytest.mark.parametrize("name", FORGED)
-def test_forged_file_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_forged_file_is_refused(name: str, tmp_path: Path) -> None:
     forge, message = FORGED[name]
     _, path = small(tmp_path)
     content = json.loads(path.read_bytes())
@@ -449,7 +449,7 @@ def test_schedule_values_must_be_numbers(
         load(path)
 
 
-def test_wrong_unit_is_refused(tmp_path: Path) -> None:
+def test_a_wrong_unit_is_refused(tmp_path: Path) -> None:
     _, path = small(tmp_path)
     path.write_bytes(resigned(json.loads(path.read_bytes()) | {"unit": "deg"}))
     with pytest.raises(ModelFileError, match='"rad" or "m", got \'deg\''):
@@ -506,7 +506,7 @@ def test_missing_folders_are_created_and_impossible_ones_named(tmp_path: Path) -
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
-def test_folder_without_permission_is_named(tmp_path: Path) -> None:
+def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "locked"
     folder.mkdir(mode=0o500)
     with pytest.raises(PermissionError, match=r"cannot write the file .*model\.json"):

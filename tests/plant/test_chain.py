@@ -217,7 +217,7 @@ def test_replaced_buffers_broadcast_over_the_batch(arm: Any) -> None:
     torch.testing.assert_close(batched.decay_rate(scales), torch.stack(rates).amax())
 
 
-def test_single_link_keeps_the_batch() -> None:
+def test_a_single_link_keeps_the_batch() -> None:
     rig = PendulumChain([1.0], [1.0])
     q, qd, tau = states(1, (2, 4))
     assert rig.mass_matrix(q).shape == (2, 4, 1, 1)

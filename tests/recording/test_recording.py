@@ -439,7 +439,7 @@ def test_wrong_time_unit_raises_a_warning(factor: float, unit: str) -> None:
         Recording(recording.time * factor, recording.q)
 
 
-def test_axis_in_milliseconds_is_not_taken_for_a_wrapped_angle() -> None:
+def test_an_axis_in_milliseconds_is_not_taken_for_a_wrapped_angle() -> None:
     q = 1e-3 * np.arange(100)[:, None]
     q[50:] -= 2 * np.pi
     with pytest.warns(RecordingWarning) as caught:
@@ -651,7 +651,7 @@ def test_convention_may_be_given_in_several_forms(tmp_path: Path, given: Any) ->
 
 
 @pytest.mark.parametrize("given", ["", "sideways", (), ("absolute", 3), 7, object(), True])
-def test_wrong_convention_is_refused_at_once(given: Any) -> None:
+def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
     # Before the file is opened.
     with pytest.raises(ValueError, match="`convention` must be one of"):
         Recording.read("absent.csv", convention=given)
@@ -765,7 +765,7 @@ def test_motor_angle_and_current_are_converted_to_the_joint() -> None:
     np.testing.assert_allclose(milli.tau, recording.tau)
 
 
-def test_motor_on_a_screw_may_be_logged_in_degrees() -> None:
+def test_a_motor_on_a_screw_may_be_logged_in_degrees() -> None:
     axis = LinearAxis(2.0, motor=Motor(gear_ratio=1000, torque_constant=0.03))
     table = motor_log(motor1=360.0 * np.arange(20))
     found = Recording.from_pandas(table, degrees=True, plant=axis)
@@ -793,7 +793,7 @@ def test_joint_without_a_current_is_named_by_its_motor() -> None:
         Recording.from_pandas(table, plant=arm)
 
 
-def test_motor_unknown_to_the_rig_is_named() -> None:
+def test_a_motor_unknown_to_the_rig_is_named() -> None:
     with pytest.raises(ValueError, match=r"motor1 belongs to a motor.*`gear_ratio`.*plant=rig"):
         Recording.from_pandas(motor_log(motor1=1.0))
     table = motor_log(q1=0.1)

@@ -22,7 +22,7 @@ def folder(path: Path, **changes: object) -> Path:
     return path
 
 
-def test_choice_is_read_back_and_shown(tmp_path: Path) -> None:
+def test_the_choice_is_read_back_and_shown(tmp_path: Path) -> None:
     run = read_run(folder(tmp_path, selection=CHOICE.to_dict()))
     assert run.selection == CHOICE
     page = to_html(run)

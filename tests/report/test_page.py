@@ -105,7 +105,7 @@ def test_figures_have_enough_contrast_in_dark_mode():
         assert (shown(colour) + 0.05) / ground > 3.0, colour
 
 
-def test_animation_moves_on_the_page(tmp_path):
+def test_an_animation_moves_on_the_page(tmp_path):
     folder = write(tmp_path)
     still = Image.new("P", (30, 20))
     still.save(folder / "figures" / "motion_1.gif", save_all=True, append_images=[still])

@@ -46,7 +46,7 @@ def one_line(folder: Path) -> str:
     return str(caught.value)
 
 
-def test_folder_without_results_is_refused(tmp_path):
+def test_a_folder_without_results_is_refused(tmp_path):
     assert "results.json" in one_line(tmp_path)
 
 

@@ -237,7 +237,7 @@ def test_old_structures_are_evicted(compilations, monkeypatch):
     assert len(compiled._known) == len(compiled._compiled_graphs) == 1
 
 
-def test_error_lists_valid_backends():
+def test_the_error_lists_valid_backends():
     with pytest.raises(ValueError, match=r"'auto', 'compiled', 'torch'"):
         rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, backend="numba")
 

@@ -126,7 +126,7 @@ def test_resolved_contact_is_solved_to_second_order() -> None:
 
 
 @pytest.mark.slow
-def test_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
+def test_a_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
     coarse, fine = error(False, 50), error(False, 400)
     assert fine < 1e-3
     assert coarse / fine > 3.0
@@ -331,7 +331,7 @@ def test_true_law_with_memory_scores_well_on_its_recording() -> None:
     assert other > 0.01
 
 
-def test_model_file_keeps_the_law(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_model_file_keeps_the_law(tmp_path) -> None:  # type: ignore[no-untyped-def]
     model = MaxwellSlip(2, elements=3).requires_grad_(False)
     again = load(save(model, tmp_path / "slip.json"))
     assert again.law.name == "maxwell_slip_3"

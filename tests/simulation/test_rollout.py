@@ -128,7 +128,7 @@ def test_shapes_times_and_first_acceleration_are_correct():
 
 
 @pytest.mark.parametrize("backend", ["torch", "compiled"])
-def test_batch_equals_single_runs(backend):
+def test_a_batch_equals_single_runs(backend):
     generator = torch.Generator().manual_seed(0)
     q0, qd0 = torch.randn(2, 2, 3, 2, generator=generator, dtype=F64)
     tau = 1e-2 * torch.randn(3, 30, 2, generator=generator, dtype=F64)
@@ -519,7 +519,7 @@ def test_arrays_and_lists_are_tensors_in_double_precision():
 
 
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_empty_batch_has_no_motion(backend):
+def test_an_empty_batch_has_no_motion(backend):
     nothing = torch.zeros(0, 2, dtype=F64)
     for settings in ({"steps": 5}, {"tau": torch.zeros(0, 5, 2, dtype=F64)}):
         out = run(smooth_model(), nothing, nothing, backend=backend, gradients=False, **settings)

@@ -59,7 +59,7 @@ def test_there_is_a_script_for_each_kind_of_model() -> None:
 
 
 @pytest.mark.slow
-def test_model_is_trained_written_and_read_by_resume(
+def test_a_model_is_trained_written_and_read_by_resume(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["train_constant.py", *QUICK, "--model", "NCFM", "--out", tmp_path]
@@ -177,7 +177,7 @@ def test_networks_are_trained_on_the_supervised_set(
 
 
 @pytest.mark.parametrize("joint", [1, 3])
-def test_interrupted_training_of_networks_writes_no_model(
+def test_an_interrupted_training_of_networks_writes_no_model(
     tmp_path: Path,
     cache: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -201,7 +201,7 @@ def test_interrupted_training_of_networks_writes_no_model(
     assert not [*tmp_path.iterdir()]
 
 
-def test_closed_output_is_no_error() -> None:
+def test_a_closed_output_is_no_error() -> None:
     script = f"import sys; sys.path.insert(0, {str(TRAINERS)!r}); import common; common.run(str)"
     process = subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -213,7 +213,9 @@ def test_closed_output_is_no_error() -> None:
 
 
 @pytest.mark.parametrize("script", [*SCRIPTS, "evolve_rules.py", "learn_online.py"])
-def test_negative_seed_is_refused_by_name(script: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_negative_seed_is_refused_by_name(
+    script: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         train(script, "--seed", "-1")
     assert "argument --seed: must be a whole number from 0, got '-1'" in capsys.readouterr().err
@@ -283,7 +285,7 @@ def test_law_without_an_adaptive_model_is_refused(tmp_path: Path) -> None:
               "--out", tmp_path)  # fmt: skip
 
 
-def test_motion_too_short_for_the_table_is_refused(
+def test_a_motion_too_short_for_the_table_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):

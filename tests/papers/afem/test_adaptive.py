@@ -74,7 +74,7 @@ def test_hysteresis_prevents_chatter() -> None:
     assert changes[0.2] == 0
 
 
-def test_class_is_entered_above_and_left_below_its_threshold() -> None:
+def test_a_class_is_entered_above_and_left_below_its_threshold() -> None:
     made = schedule(hysteresis=0.2, time_constant=1e-4)
     sizes = [5.0, 11.9, 12.1, 11.0, 9.0, 8.4, 8.2, 119.0, 121.0, 90.0, 84.0, 83.0, 1.0]
     qdd = torch.tensor(sizes, dtype=F64)[:, None]

@@ -132,7 +132,7 @@ def test_stopped_fit_keeps_the_constant_law(case):
     assert "Stopped before the classes were found" in found.status
 
 
-def test_stop_after_the_evidence_accepted_the_classes_keeps_them(case, monkeypatch):
+def test_a_stop_after_evidence_accepted_the_classes_keeps_them(case, monkeypatch):
     searches, original = [], ClassFitter.likeliest
 
     def likeliest(self, *about):

@@ -54,7 +54,7 @@ def test_known_friction_is_recovered(recorded, method):
     assert found.motions is not None
 
 
-def test_free_run_is_one_window(recorded):
+def test_a_free_run_is_one_window(recorded):
     model = NCFM(2, v_smooth=V_SMOOTH)
     found = fitted(recorded, model, method="sqp", horizon=None, max_evaluations=30)
     assert found.residuals.shape[0] == 1

@@ -47,7 +47,7 @@ def test_upright_rig_is_unstable_and_its_closed_loops_are_stable() -> None:
     assert np.abs(np.linalg.eigvals(kept @ LINEAR.a)).max() < 1.0
 
 
-def test_pose_that_is_no_equilibrium_is_refused() -> None:
+def test_a_pose_that_is_no_equilibrium_is_refused() -> None:
     leaning = linearise(PLANT, UPRIGHT + 0.1, UPRIGHT, UPRIGHT, 1e-3)
     with pytest.raises(ValueError, match="not in equilibrium"):
         balance_gains(leaning, study.weights(4))
@@ -82,7 +82,7 @@ def test_compensation_reduces_the_limit_cycle_of_a_balanced_link() -> None:
     assert found[study.TRUTH][key] < 0.6 * found[study.NONE][key]
 
 
-def test_fallen_rig_has_no_tracking_error() -> None:
+def test_a_fallen_rig_has_no_tracking_error() -> None:
     friction = study.true_friction(PLANT)
     controllers = {study.NONE: Feedback(PLANT, TOP)}
     runs = study.controlled(PLANT, friction, controllers, seconds=0.5)
@@ -99,7 +99,7 @@ def test_gains_along_a_motion_at_upright_converge_to_those_at_upright() -> None:
     np.testing.assert_allclose(found[-1].observer, TOP.observer, rtol=1e-3, atol=1e-6)
 
 
-def test_swing_up_without_time_is_refused() -> None:
+def test_a_swing_up_without_time_is_refused() -> None:
     with pytest.raises(ValueError, match="no swing-up within"):
         plan_swing_up(PLANT, None, seconds=0.5, windows=5, max_steps=5)
 

@@ -35,7 +35,7 @@ SMALL = {
 }
 
 
-def test_file_that_is_no_text_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
     (tmp_path / "rules.json").write_bytes(b'{"name": "\xff"}')
     with pytest.raises(ValueError, match=r"rules\.json: a rule file is UTF-8 text"):
         load_rules(tmp_path / "rules.json")

@@ -87,7 +87,7 @@ def test_sets_are_improved_and_frozen_ones_unchanged() -> None:
     assert all(torch.equal(kept[name], value) for name, value in layer.state_dict().items())
 
 
-def test_interrupt_is_passed_on_with_the_best_so_far() -> None:
+def test_an_interrupt_is_passed_on_with_the_best_so_far() -> None:
     x = samples(300)
     calls = 0
 

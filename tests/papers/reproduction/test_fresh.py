@@ -51,7 +51,7 @@ def test_fresh_releases_can_be_predicted(pose: tuple[float, float, float]) -> No
     assert np.abs(off - true).max() <= 16 * count
 
 
-def test_figure_shows_the_medians_of_the_table(tmp_path: Path) -> None:
+def test_the_figure_shows_the_medians_of_the_table(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NFNCFM": 0.5, "LFM": None})
     figure = figures.fresh_errors(made)
     medians = tables.fresh(made, tables.NINE)

@@ -90,7 +90,7 @@ def found(name: str) -> object:
     raise AssertionError(f"no part of {name} can be imported")
 
 
-def test_page_names_the_code() -> None:
+def test_the_page_names_the_code() -> None:
     assert len(NAMES) > 40
 
 

@@ -23,7 +23,7 @@ def test_files_have_unique_names() -> None:
     assert SWING_UP in names
 
 
-def test_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
+def test_the_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
     made = workspace(tmp_path, {"NFLFM": 0.123})
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "rmse.png").write_bytes(b"\x89PNG")

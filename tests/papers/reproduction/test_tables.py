@@ -50,7 +50,7 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
     return made
 
 
-def test_error_over_recordings_is_their_root_mean_square(tmp_path: Path) -> None:
+def test_an_error_over_recordings_is_their_root_mean_square(tmp_path: Path) -> None:
     found = tables.rmse(workspace(tmp_path, {"NCFM": 2.0}), ["NCFM"])
     np.testing.assert_allclose(found.loc["NCFM"], np.array([2.0, 4.0, 6.0]) / np.sqrt(2))
     train = tables.rmse(workspace(tmp_path, {}), ["NCFM"], split="train")

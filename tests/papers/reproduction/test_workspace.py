@@ -13,7 +13,7 @@ from nfriction.papers.reproduction.workspace import FULL, QUICK, Bench, Workspac
 from tests.fitting.recordings import pendulum, swing
 
 
-def test_finished_stage_is_found_again(tmp_path: Path) -> None:
+def test_a_finished_stage_is_found_again(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, QUICK)
     assert workspace.result("NCFM") is None
     workspace.write_arrays("NCFM", {"q": np.arange(6.0).reshape(2, 3)})

@@ -101,7 +101,7 @@ def test_bearings_carry_the_links_weight_and_inertia() -> None:
 # Random choices of a seed
 
 
-def test_effect_is_the_same_in_every_truth_of_a_seed() -> None:
+def test_an_effect_is_the_same_in_every_truth_of_a_seed() -> None:
     one, two = family.parameters("warming", 4), family.parameters("load+warming", 4)
     other = family.parameters("warming", 5)
     for name, parameter in family.PARAMETERS.items():

@@ -120,7 +120,7 @@ def test_friction_has_the_effects_of_its_data_card() -> None:
     assert friction.viscosity(40.0) == pytest.approx(0.85, abs=0.005)  # warming
 
 
-def test_rig_of_another_kind_is_refused() -> None:
+def test_a_rig_of_another_kind_is_refused() -> None:
     with pytest.raises(ValueError, match="three links on a fixed pivot"):
         Links.of(rigs.tlrip(arm="free"))
 
@@ -171,7 +171,7 @@ def test_both_parts_have_a_hanging_and_an_upright_release(second: twin.Twin) -> 
         assert min(heights) < 0 < max(heights)
 
 
-def test_shorter_twin_is_the_beginning_of_a_longer_one(second: twin.Twin) -> None:
+def test_a_shorter_twin_is_the_beginning_of_a_longer_one(second: twin.Twin) -> None:
     short = twin.make("tlrip", duration=0.2)
     for label, recording in short.recordings.items():
         assert recording.digest() == second.recordings[label][:200].digest()
