@@ -1,4 +1,4 @@
-"""Settings for every test: one thread, float64 by default where a test does not say."""
+"""Settings for every test: one thread, float64 unless a test sets another type."""
 
 import gc
 import os
@@ -19,9 +19,10 @@ settings.load_profile("default")
 
 @pytest.fixture(autouse=True)
 def compiler_effort(request: pytest.FixtureRequest) -> None:
-    """Compile kernels in a third of the time, to a third of the speed, but in the compiler's tests.
+    """Compile kernels in a third of the time and to a third of the speed, except in the compiler's
+    tests.
 
-    Elsewhere most tests call a kernel a few times only. Processes they start do as users' do.
+    Elsewhere most tests call a kernel only a few times. Child processes compile as users' do.
     """
     jit.EFFORT = 1 if request.path.parent.name == "codegen" else 0
 
@@ -29,8 +30,8 @@ def compiler_effort(request: pytest.FixtureRequest) -> None:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the real recordings: `NFRICTION_DATA`, else `../shared/data`."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("NFRICTION_DATA", beside))
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("NFRICTION_DATA", default))
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}; set NFRICTION_DATA to run these tests")
     return folder
@@ -39,14 +40,14 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def reference_dir(request: pytest.FixtureRequest) -> Path:
     """Folder of exact plant states: `NFRICTION_REFERENCE`, else `../shared/reference`."""
-    beside = Path(__file__).resolve().parents[2] / "shared" / "reference"
-    folder = Path(os.environ.get("NFRICTION_REFERENCE", beside))
+    default = Path(__file__).resolve().parents[2] / "shared" / "reference"
+    folder = Path(os.environ.get("NFRICTION_REFERENCE", default))
     if not folder.is_dir():
         pytest.skip(f"no reference states at {folder}; set NFRICTION_REFERENCE to run these tests")
     return folder
 
 
-# Of the long tests over all models the short run takes those of the richest laws alone.
+# Of the long tests over all models, the short run takes only those of the richest laws.
 LEFT_TO_THE_SLOW_RUN = {
     *("CFM", "ACFM", "NFCFM"), *("CVFM", "ACVFM", "NFCVFM"), "ANCFM", "NFNCFM",
 }  # fmt: skip
@@ -54,7 +55,7 @@ LEFT_TO_THE_SLOW_RUN = {
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what only repeats, with a law that is part of another, what another test does."""
+    """Mark tests of a nested law as slow if they repeat those of the full law."""
     for item in items:
         named = LEFT_TO_THE_SLOW_RUN.intersection(re.split(r"\W+", item.name))
         if named and item.path.parent.name in ("export", "simulation", "codegen"):
@@ -62,7 +63,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let garbage collection pass over libraries and collected tests, which all stay."""
+    """Exclude libraries and collected tests from garbage collection, since they all stay."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000)

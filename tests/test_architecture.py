@@ -1,4 +1,4 @@
-"""How the package hangs together: arrows point one way, and a few habits hold everywhere."""
+"""Structure of the package: one-way imports, and conventions that apply everywhere."""
 
 import ast
 import importlib
@@ -18,8 +18,9 @@ import nfriction
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nfriction"
 
-# Imports each part of the package may have from the rest. A part is a top-level subpackage, or one
-# of the two halves of `io`: files in general, and model files, which know plants and friction.
+# Imports that each part of the package may have from the rest. A part is a top-level subpackage, or
+# one of the two halves of `io`: files in general, and model files, which depend on plants and
+# friction.
 ALLOWED: dict[str, set[str]] = {
     "version": set(),
     "optim": set(),
@@ -37,13 +38,13 @@ ALLOWED: dict[str, set[str]] = {
     },
     "export": {"version", "io", "io.model", "plant", "friction", "codegen", "signals"},
 }
-# The papers' own methods are a wing: the command line, the loader of simulated data sets and the
-# papers' scripts use them, no other.
+# The papers' own methods are separate: only the command line, the loader of simulated data sets and
+# the papers' scripts use them.
 MAY_USE_PAPERS = {"papers", "cli", "datasets"}
-# Only the command line talks to a person.
+# Only the command line prints.
 MAY_PRINT = "cli/"
-# TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no
-# use of it: a module elsewhere may have to.
+# TorchScript is deprecated upstream; one part uses it. Checking `is_scripting` is no use of it: a
+# module elsewhere may need to.
 MAY_SCRIPT = {"export"}
 
 
@@ -66,14 +67,14 @@ def part(path: Path) -> str:
 
 
 def part_of(names: Sequence[str]) -> str:
-    """The part that a dotted name (`nfriction`, ...) lies in."""
+    """The part of a dotted name (`nfriction`, ...)."""
     if names[1:2] == ("io",) and len(names) > 2 and names[2].startswith("model_"):
         return "io.model"
     return names[1] if len(names) > 1 else "__init__"
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Full names of all that a file imports, wherever it does."""
+    """Full names of all imports of a file."""
     for node in nodes(path)[ast.Import]:
         yield from (alias.name for alias in node.names)
     for node in nodes(path)[ast.ImportFrom]:
@@ -97,7 +98,7 @@ def report(found: list[str]) -> None:
     assert not found, "\n" + "\n".join(found)
 
 
-def test_the_checks_see_the_package() -> None:
+def test_checks_cover_the_package() -> None:
     assert len(modules()) > 50
     assert set(ALLOWED) <= {part(path) for path in modules()}
 
@@ -123,7 +124,7 @@ def test_the_core_does_not_import_the_papers() -> None:
     )
 
 
-def test_the_allowed_arrows_make_no_circle() -> None:
+def test_allowed_imports_are_acyclic() -> None:
     settled: set[str] = set()
     while len(settled) < len(ALLOWED):
         ready = {name for name in ALLOWED if ALLOWED[name] <= settled} - settled
@@ -133,11 +134,11 @@ def test_the_allowed_arrows_make_no_circle() -> None:
 
 @pytest.mark.parametrize("folder", ["datasets", "trainers", "examples", "benchmarks", "tests"])
 def test_folders_of_scripts_are_no_packages(folder: str) -> None:
-    # With one, `datasets/` would hide another package of that name.
+    # As a package, `datasets/` would hide another one of that name.
     report([str(p.relative_to(ROOT)) for p in (ROOT / folder).rglob("__init__.py")])
 
 
-def test_scripts_import_what_is_there() -> None:
+def test_imports_of_scripts_exist() -> None:
     lost = []
     for folder in ("datasets", "trainers", "examples", "benchmarks"):
         for path in (ROOT / folder).rglob("*.py"):
@@ -149,7 +150,7 @@ def test_scripts_import_what_is_there() -> None:
 
 
 def test_no_public_name_hides_a_module() -> None:
-    # A package that offers a function of its module's name can only show one of them.
+    # A package that exports a function of its module's name can only show one of them.
     report(
         [
             f"{path.relative_to(ROOT)} offers {name}, which hides the module"
@@ -167,12 +168,12 @@ def package(path: Path) -> tuple[str, ...]:
     return path.parent.relative_to(ROOT).parts
 
 
-def test_every_module_says_what_it_is_for() -> None:
+def test_every_module_has_a_docstring() -> None:
     whole = {path: nodes(path)[ast.Module][0] for path in modules()}
     report([str(p.relative_to(ROOT)) for p, tree in whole.items() if not ast.get_docstring(tree)])
 
 
-def test_every_public_name_is_there_and_says_what_it_is_for() -> None:
+def test_every_public_name_exists_and_has_a_docstring() -> None:
     assert sorted(nfriction.__all__) == sorted(set(nfriction.__all__))
     for name in nfriction.__all__:
         thing = getattr(nfriction, name)
@@ -195,11 +196,11 @@ for call in (nfriction.FrictionEstimator, lambda: nfriction.export.onnx(model, "
 """
 
 
-def test_without_extras_the_library_loads_and_says_what_to_install() -> None:
+def test_without_extras_the_library_loads_and_names_what_to_install() -> None:
     command = [sys.executable, "-c", WITHOUT_EXTRAS]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "pip install nfriction[sklearn]" in said
-    assert "pip install nfriction[onnx]" in said
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "pip install nfriction[sklearn]" in output
+    assert "pip install nfriction[onnx]" in output
 
 
 def test_only_command_lines_print() -> None:
@@ -214,7 +215,7 @@ def test_only_command_lines_print() -> None:
     )
 
 
-def test_nothing_is_pickled_evaluated_or_given_to_a_shell() -> None:
+def test_pickle_eval_and_shell_are_not_used() -> None:
     modules_refused = {"pickle", "dill", "cloudpickle", "marshal", "shelve"}
     calls_refused = {"eval", "os.system", "torch.load"}
     found = []
@@ -233,7 +234,7 @@ def test_nothing_is_pickled_evaluated_or_given_to_a_shell() -> None:
     report(found)
 
 
-def test_torchscript_has_one_home() -> None:
+def test_torchscript_is_used_in_one_part() -> None:
     report(
         [
             f"{path.relative_to(ROOT)}:{node.lineno} {dotted(node)}"
@@ -252,7 +253,7 @@ def test_torchscript_has_one_home() -> None:
     )
 
 
-def test_errors_are_caught_by_name() -> None:
+def test_exceptions_are_caught_by_name() -> None:
     broad = {"Exception", "BaseException"}
     report(
         [
@@ -264,9 +265,9 @@ def test_errors_are_caught_by_name() -> None:
     )
 
 
-def test_the_version_is_told_once() -> None:
-    told = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
-    assert told is None or told[1] == nfriction.__version__
+def test_version_is_defined_once() -> None:
+    found = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert found is None or found[1] == nfriction.__version__
 
 
 # Size of the package today: a ratchet, lowered where code goes and raised only beside features that
@@ -282,8 +283,8 @@ STORY = (
     "evaluation/score.py",
 )
 MOST_LINES_OF_THE_STORY = 1_800
-MOST_FLOORS_OF_FITTING = 8
-# Entry points whose options are keywords of their own; everything else takes eight arguments.
+MOST_IMPORT_LEVELS_OF_FITTING = 8
+# Entry points with separate keyword options; all other functions take at most eight arguments.
 MOST_ARGUMENTS = 8
 MAY_TAKE_MORE = 5
 SCHEDULES = {"Schedule", "Tabulated", "Constant", "NeuroFuzzy", "Adaptive", "RBFCoefficients"}
@@ -294,7 +295,7 @@ def lines(path: Path) -> int:
     return len(path.read_text(encoding="utf-8").splitlines())
 
 
-def test_the_house_stays_small() -> None:
+def test_package_stays_small() -> None:
     of_papers = sum(lines(path) for path in modules() if part(path) == "papers")
     total = sum(map(lines, modules()))
     assert total <= MOST_LINES
@@ -302,7 +303,7 @@ def test_the_house_stays_small() -> None:
     assert len(modules()) <= MOST_FILES
 
 
-def test_a_folder_can_be_surveyed() -> None:
+def test_folders_have_few_files() -> None:
     folders = {path.parent for path in modules()}
     held = {f: [p for p in f.glob("*.py") if p.name != "__init__.py"] for f in folders}
     report(
@@ -314,14 +315,14 @@ def test_a_folder_can_be_surveyed() -> None:
     )
 
 
-def test_the_story_is_short_and_named_in_the_readme() -> None:
+def test_core_files_are_short_and_named_in_the_readme() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     report([f"{name} is not in the README" for name in STORY if f"`{name}`" not in readme])
     assert sum(lines(PACKAGE / name) for name in STORY) <= MOST_LINES_OF_THE_STORY
 
 
-def test_fitting_has_few_floors() -> None:
-    """A floor is a module's longest chain of imports within `fitting`."""
+def test_fitting_has_few_import_levels() -> None:
+    """The level of a module is its longest chain of imports within `fitting`."""
     names = {
         ".".join(p.relative_to(ROOT).with_suffix("").parts): p
         for p in (PACKAGE / "fitting").rglob("*.py")
@@ -329,11 +330,11 @@ def test_fitting_has_few_floors() -> None:
     }
 
     @cache
-    def floor(name: str) -> int:
+    def level(name: str) -> int:
         below = {n.rsplit(".", 1)[0] for n in imported(names[name])} | set(imported(names[name]))
-        return 1 + max((floor(n) for n in below & names.keys() - {name}), default=0)
+        return 1 + max((level(n) for n in below & names.keys() - {name}), default=0)
 
-    assert max(map(floor, names)) <= MOST_FLOORS_OF_FITTING
+    assert max(map(level, names)) <= MOST_IMPORT_LEVELS_OF_FITTING
 
 
 def test_functions_take_few_arguments() -> None:
@@ -348,14 +349,14 @@ def test_functions_take_few_arguments() -> None:
 
 
 def type_tests(path: Path) -> Iterator[tuple[int, set[str]]]:
-    """Lines of `isinstance`, each with the names of the classes asked for."""
+    """Lines of `isinstance`, each with the names of the tested classes."""
     for node in nodes(path)[ast.Call]:
         if dotted(node.func) == "isinstance":
             named = (dotted(n) for n in ast.walk(node.args[1]))
             yield node.lineno, {name.rsplit(".", 1)[-1] for name in named if name}
 
 
-def test_schedules_are_not_asked_for_their_type() -> None:
+def test_schedules_are_not_tested_for_their_type() -> None:
     report(
         [
             f"{path.relative_to(ROOT)}:{line} {', '.join(sorted(names & SCHEDULES))}"
@@ -367,7 +368,7 @@ def test_schedules_are_not_asked_for_their_type() -> None:
     )
 
 
-def test_controllers_are_hardly_asked_for_their_type() -> None:
+def test_controllers_are_rarely_tested_for_their_type() -> None:
     found = [
         f"{path.relative_to(ROOT)}:{line}"
         for path in (PACKAGE / "export").rglob("*.py")

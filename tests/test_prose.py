@@ -1,4 +1,4 @@
-"""Prose lint: docstrings, messages, comments and documents in the field's standard terms."""
+"""Prose lint: docstrings, messages, comments, test names and documents in standard terms."""
 
 import ast
 import io
@@ -13,8 +13,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "nfriction"
 SOURCES = sorted(
     path
-    for folder in ("nfriction", "trainers", "datasets", "examples", "benchmarks")
+    for folder in ("nfriction", "trainers", "datasets", "examples", "benchmarks", "tests")
     for path in (ROOT / folder).rglob("*.py")
+    if path != Path(__file__)  # it lists the habits
 )
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
@@ -43,6 +44,10 @@ HABITS = {
     r"\bbeside other\b": "compared with other",
 }
 ANY_HABIT = re.compile("|".join(f"(?:{h})" for h in HABITS), re.IGNORECASE)
+TEST_NAME_HABIT = re.compile(
+    r"(?<![a-z])(told|tells|said|misgivings|harmless|held_back|left_over|made_up_for)(?![a-z])"
+)
+LONGEST_TEST_NAME = 68
 
 
 def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
@@ -91,6 +96,18 @@ def test_prose_uses_standard_terms(paths: list[Path]) -> None:
             for path in paths
             for line, text in prose_of(path)
             if ANY_HABIT.search(text)
+        ]
+    )
+
+
+def test_test_names_are_short_and_in_standard_terms() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
+            for path in (ROOT / "tests").rglob("test_*.py")
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+            if len(node.name) > LONGEST_TEST_NAME or TEST_NAME_HABIT.search(node.name)
         ]
     )
 

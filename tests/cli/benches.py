@@ -1,4 +1,4 @@
-"""A bench as a user has it: a rig file, recordings, and runs of the command line on them."""
+"""A user's test bench: a rig file, recordings, and command-line runs on them."""
 
 import json
 from pathlib import Path
@@ -8,12 +8,12 @@ import torch
 
 from nfriction import LFM, PendulumChain, Recording, cli, rollout
 
-# A second in windows of a half does not tell air drag from dry friction.
+# One second in 0.5 s windows cannot separate air drag from dry friction.
 QUICK = ["--windows", "0.5", "--max-steps", "3", "--no-drag"]
 
 
 def pendulum(**changes: object) -> PendulumChain:
-    """A bench whose files count from hanging."""
+    """A bench whose files measure angles from hanging."""
     return PendulumChain(
         mass=[0.15], com=[0.15], length=[0.3], inertia=[1e-4], name="bench",
         convention=("absolute", "hanging"), position_quantum=1e-4, **changes,
@@ -21,7 +21,7 @@ def pendulum(**changes: object) -> PendulumChain:
 
 
 def swing(name: str, start: float) -> Recording:
-    """A released pendulum with known friction, seen by an encoder, over 1 s and a lead-in."""
+    """A released pendulum with known friction, sampled by an encoder over 1 s and a lead-in."""
     q0 = torch.tensor([start + np.pi], dtype=torch.float64)
     friction = LFM(1, [[2e-4, 1e-3]])
     with torch.no_grad():
@@ -34,7 +34,7 @@ def swing(name: str, start: float) -> Recording:
 
 
 def compare(bench: Path, out: Path, *more: str, models: str = "NCFM") -> int:
-    """`nfriction compare` of the bench's recordings, quickly."""
+    """`nfriction compare` of the bench's recordings with quick settings."""
     files = [str(bench / "a.csv.gz"), "--test", str(bench / "b.csv")]
     rig = ["--rig", str(bench / "bench.json"), "--models", models, "--out", str(out)]
     return cli.main(["compare", *files, *rig, *QUICK, *more])

@@ -1,4 +1,4 @@
-"""Fixtures of the command line's tests."""
+"""Fixtures of the command-line tests."""
 
 import contextlib
 import io
@@ -13,7 +13,7 @@ from tests.cli.benches import compare, pendulum, swing
 
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a rig, a recording to train on and one to test on."""
+    """A folder with a rig, a training and a test recording."""
     folder = tmp_path_factory.mktemp("bench")
     rigs.write(pendulum(), folder / "bench.json")
     swing("a", 2.0).write(folder / "a.csv.gz")
@@ -31,16 +31,16 @@ def compared(bench: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def again(bench: Path) -> tuple[Path, str]:
-    """Folder of the same comparison, by plain names and without figures, and what it printed."""
-    out, said = bench / "again", io.StringIO()
-    with contextlib.redirect_stdout(said):
+    """Folder and output of the same comparison, with plain file names and without figures."""
+    out, printed = bench / "again", io.StringIO()
+    with contextlib.redirect_stdout(printed):
         assert compare(bench, out, "--no-figures", models="viscous,load-coulomb") == 0
-    return out, said.getvalue()
+    return out, printed.getvalue()
 
 
 @pytest.fixture
 def failing(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run a command that must fail: status 2 and one line, which is returned."""
+    """Run a command that must fail with status 2 and one line, which is returned."""
 
     def run(*words: object) -> str:
         assert cli.main([str(w) for w in words]) == 2

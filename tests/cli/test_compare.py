@@ -1,4 +1,4 @@
-"""`compare` and `demo` as a user meets them: what they write and print, how they stop."""
+"""`compare` and `demo` as a user runs them: files, output, interruption."""
 
 import logging
 import os
@@ -43,7 +43,7 @@ def test_friction_predicts_better_than_none(compared: Path) -> None:
     assert error["LFM"] < error["NCFM"] < error["no friction"]
 
 
-def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
+def test_table_contains_the_errors_of_the_results(compared: Path) -> None:
     table = pd.read_csv(compared / "table.csv", float_precision="round_trip")
     models = results(compared)["models"]
     of = table[(table.horizon == "free run") & (table.joint == "all") & (table.recording == "b")]
@@ -54,7 +54,7 @@ def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
     assert set(of.model) == set(models)
 
 
-def test_models_load_and_scripts_equal_them(compared: Path) -> None:
+def test_model_files_load_and_scripts_agree_with_them(compared: Path) -> None:
     qd = torch.linspace(-3, 3, 7, dtype=torch.float64)[:, None]
     inputs = (qd, torch.zeros_like(qd), torch.ones_like(qd))
     for name in ("NCFM", "LFM"):
@@ -63,7 +63,7 @@ def test_models_load_and_scripts_equal_them(compared: Path) -> None:
         torch.testing.assert_close(script(*inputs), model(*inputs), rtol=0, atol=1e-12)
 
 
-def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
+def test_figures_are_drawn_and_no_temporary_files_remain(compared: Path) -> None:
     drawn = {path.stem for path in (compared / "figures").glob("*.png")}
     assert {"rmse_test", "positions_test_b", "torque_over_velocity"} <= drawn
     assert not list(compared.rglob(".*"))
@@ -77,28 +77,28 @@ def test_equal_input_gives_equal_bytes(compared: Path, again: tuple[Path, str]) 
     assert results(out) | own == results(compared) | own
 
 
-def test_verdict_names_the_winner_and_its_file(again: tuple[Path, str]) -> None:
-    out, said = again
-    assert "models: NCFM: viscous, LFM: load-coulomb\n" in said
-    assert "best on test recordings: LFM" in said
-    (file,) = re.findall(r"its model file: (.*)", said)
+def test_output_names_the_best_model_and_its_file(again: tuple[Path, str]) -> None:
+    out, printed = again
+    assert "models: NCFM: viscous, LFM: load-coulomb\n" in printed
+    assert "best on test recordings: LFM" in printed
+    (file,) = re.findall(r"its model file: (.*)", printed)
     assert Path(file).is_file()
     coefficients = results(out)["models"]["LFM"]["coefficients"]
-    told = said.partition("Coefficients of LFM\n")[2]
-    header, row, *_ = told.splitlines()
+    printed_table = printed.partition("Coefficients of LFM\n")[2]
+    header, row, *_ = printed_table.splitlines()
     assert re.split(r"\s{2,}", header.strip()) == ["B [N m s/rad]", "C [N m]"]
     values = [float(word) for word in row.split()[1:]]
     # Four digits are printed.
     assert values == pytest.approx([coefficients["B"][0], coefficients["C"][0]], rel=1e-3)
-    assert "windows of 5 s: none, b lasts 1.2 s" in said
-    assert f"\nresults and models are in {out}\n" in said
+    assert "windows of 5 s: none, b lasts 1.2 s" in printed
+    assert f"\nresults and models are in {out}\n" in printed
 
 
-def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
+def test_output_ends_with_the_improvement_and_next_commands(
     again: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, said = again
-    *_, without, learnt, report, export = said.splitlines()
+    out, printed = again
+    *_, without, learnt, report, export = printed.splitlines()
     free = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(out)["models"].items()}
     none, best = free["no friction"], free["LFM"]
     assert without.endswith(f" miss the measured motion by {1e3 * none:.3g} mrad;")
@@ -114,7 +114,7 @@ def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
     assert list((tmp_path / "controller").glob("*.c"))
 
 
-def test_without_test_recordings_there_is_no_verdict(
+def test_without_test_recordings_no_model_is_named_best(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [str(bench / "a.csv.gz"), "--rig", str(bench / "bench.json"), "--models", "NCFM"]
@@ -133,11 +133,11 @@ def test_initial_states_are_used_and_missing_ones_named(
     assert f"warning: {states} has no state of a;" in capsys.readouterr().err
     plain, off = (results(out)["models"]["NCFM"] for out in (compared, bench / "s"))
     assert off["train"] == plain["train"]
-    # The run starts 0.1 rad off and so ends about as far off.
+    # The run starts with an error of 0.1 rad and keeps about that error.
     assert off["test"]["b"]["free_run"]["all"] > 0.03
 
 
-def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
+def test_no_fit_plant_keeps_the_plant_and_drag_adds_terms(bench: Path) -> None:
     terms = []
     for k, option in enumerate((["--no-fit-plant"], [], ["--drag"])):
         out = bench / f"plant{k}"
@@ -148,46 +148,46 @@ def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
     assert given < fitted < drag
 
 
-def test_the_choice_on_training_data_is_told_with_its_reason(
+def test_choice_on_training_data_is_printed_with_its_reason(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(bench, bench / "chosen", "--select", "--no-figures", models="NCFM,LFM") == 0
-    told = capsys.readouterr().out.partition("training data alone would choose ")[2]
-    chosen, reason = told.split("\n")[0].split(": ")
+    choice = capsys.readouterr().out.partition("training data alone would choose ")[2]
+    chosen, reason = choice.split("\n")[0].split(": ")
     assert chosen in ("NCFM", "LFM")
     assert results(bench / "chosen")["selection"]["chosen"] == chosen
     assert "error on hold-out blocks" in reason
-    # 0.4 s were left out each time, the first half of which is the lead-in.
-    assert re.search(r"0\.2\d* s simulations", told)
+    # Each hold-out block has 0.4 s, half of which is the lead-in.
+    assert re.search(r"0\.2\d* s simulations", choice)
     for name in ("NCFM", "LFM"):
-        assert re.search(rf"^{name} +[\d.]+ +\d +(yes|no)$", told, re.MULTILINE)
+        assert re.search(rf"^{name} +[\d.]+ +\d +(yes|no)$", choice, re.MULTILINE)
 
 
-def test_warnings_and_intervals_of_fits_are_told(
+def test_warnings_and_intervals_of_fits_are_printed(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(bench, bench / "wary", "--no-figures", models="NCFM,LFM") == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     found = results(bench / "wary")
     fits, best = found["models"], found["best"]["model"]
     for name in ("NCFM", "LFM"):
         for warning in fits[name]["fit"]["warnings"]:
-            assert f"\n  - {warning}" in said
-    table = said.partition("95 % confidence intervals")[2]
+            assert f"\n  - {warning}" in printed
+    table = printed.partition("95 % confidence intervals")[2]
     for name, (low, high) in fits[best]["fit"]["intervals"].items():
         (row,) = (line for line in table.splitlines() if line.startswith(f"{name} "))
-        told = [None if word == "unknown" else float(word) for word in row.split()[-2:]]
-        assert told == [pytest.approx(x, rel=1e-3) for x in (low, high)]
+        interval = [None if word == "unknown" else float(word) for word in row.split()[-2:]]
+        assert interval == [pytest.approx(x, rel=1e-3) for x in (low, high)]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a file name")
 @pytest.mark.slow
-def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Path) -> None:
+def test_file_name_that_is_not_unicode_loses_no_fits(bench: Path, tmp_path: Path) -> None:
     odd, out = tmp_path / os.fsdecode(b"surr\xff.csv"), tmp_path / "out"
     shutil.copy(bench / "b.csv", odd)
     words = [bench / "a.csv.gz", "--test", odd, "--rig", bench / "bench.json", "--models", "NCFM"]
     words += [*QUICK, "--out", out, "--log-file", tmp_path / "log"]
-    # In a process of its own, whose streams have the encoding of a terminal.
+    # In a separate process, whose streams have a terminal's encoding.
     command = [sys.executable, "-m", "nfriction", "compare"]
     subprocess.run([*command, *words], check=True, capture_output=True)
     assert (out / "models" / "NCFM.pt").is_file()
@@ -196,14 +196,14 @@ def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Pat
         assert "surr" in file.read_text(encoding="utf-8")
 
 
-def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
+def test_ctrl_c_ends_the_run_although_the_solver_catches_it(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = []
+    stages = []
     step = Progress.step
 
     def interrupted_step(self: Progress, stage: str) -> None:
-        told.append(stage)
+        stages.append(stage)
         signal.raise_signal(signal.SIGINT)
         step(self, stage)
 
@@ -211,13 +211,13 @@ def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     out = bench / "interrupted"
     before = signal.getsignal(signal.SIGINT)
     assert compare(bench, out, models="NCFM,LFM") == 130
-    assert len(told) == 1  # the second model was never begun
+    assert len(stages) == 1  # the second model was never started
     assert "interrupted (fit NCFM)" in capsys.readouterr().err
     assert not list(out.iterdir())
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_data_on_which_the_algebra_fails_are_an_error_in_a_line(
+def test_linear_algebra_failure_is_a_one_line_error(
     bench: Path, monkeypatch: pytest.MonkeyPatch, failing: Callable[..., str]
 ) -> None:
     def fail(*_: object, **__: object) -> None:
@@ -240,7 +240,7 @@ def test_interrupt_outside_a_solver(
     assert not list((bench / "stopped").iterdir())
 
 
-def test_processes_change_nothing_and_are_checked(
+def test_process_count_is_checked_and_does_not_change_results(
     bench: Path, compared: Path, failing: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--jobs"]
@@ -255,26 +255,26 @@ def test_processes_change_nothing_and_are_checked(
     assert (out / "table.csv").read_bytes() == (compared / "table.csv").read_bytes()
 
 
-def test_the_log_tells_what_was_done_and_the_console_no_more(
+def test_log_file_records_progress_that_the_console_omits(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "night.log"
     for _ in range(2):
         assert compare(bench, tmp_path / "out", "--no-figures", "--log-file", str(log)) == 0
     lines = log.read_text().splitlines()
-    # The second run is told below the first.
+    # The second run is appended below the first.
     assert sum("nfriction compare" in line for line in lines) == 2
-    for told in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on test recordings: NCFM"):
-        assert sum(line.split("INFO ")[1].startswith(told) for line in lines) >= 2
+    for entry in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on test recordings: NCFM"):
+        assert sum(line.split("INFO ")[1].startswith(entry) for line in lines) >= 2
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING) ", x) for x in lines)
     assert "INFO" not in capsys.readouterr().err
     assert not logging.getLogger("nfriction").handlers
 
 
-def test_a_model_that_cannot_be_fitted_is_told_beside_the_others(
+def test_failed_model_is_reported_with_the_others(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second of swinging has one class of acceleration, which is too few for an adaptive one."""
+    """One second of swinging has one class of acceleration, too few for an adaptive model."""
     out = bench / "partly"
     assert compare(bench, out, "--no-figures", models="NCFM,ANCFM") == 1
     assert "ANCFM: not fitted: the acceleration hardly varies" in capsys.readouterr().out
@@ -284,7 +284,9 @@ def test_a_model_that_cannot_be_fitted_is_told_beside_the_others(
 
 
 @pytest.mark.slow
-def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_writes_results_and_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["demo", "--seconds", "1", "--models", "NCFM", "--out", str(tmp_path), "--no-figures"]
     assert cli.main(words) == 0
     assert "2 for testing" in capsys.readouterr().out
@@ -292,12 +294,12 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
-def test_triple_pendulum_test(data_dir: Path, tmp_path: Path) -> None:
-    """Half of the card's experiment: viscous friction leaves 11.6 mrad in 10 s, 6.1 mrad in 5 s."""
+def test_triple_pendulum_errors_match_the_data_card(data_dir: Path, tmp_path: Path) -> None:
+    """Half of the data card's experiment: viscous friction has 11.6 mrad in 10 s, 6.1 in 5 s."""
     data = data_dir / "multiarm_pendulum"
     words = [str(data / "triple_b0.csv.gz"), "--test", str(data / "triple_b2.csv.gz")]
     words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]
-    # As on the card: no air drag.
+    # As on the data card: no air drag.
     words += ["--models", "NCFM,LFM", "--no-drag", "--no-figures", "--out", str(tmp_path)]
     assert cli.main(["compare", *words]) == 0
     found = {n: m["test"]["triple_b2"] for n, m in results(tmp_path)["models"].items()}
@@ -305,12 +307,12 @@ def test_triple_pendulum_test(data_dir: Path, tmp_path: Path) -> None:
         pairs = zip(found[name]["free_run"]["joints"], found["no friction"]["free_run"]["joints"],
                     strict=True)  # fmt: skip
         assert all(own < none for own, none in pairs)
-    # The card's ratios are free of each other, ours keep to the chain's geometry.
+    # The card's ratios are independent, ours are constrained by the chain's geometry.
     assert 0.8 < found["NCFM"]["free_run"]["all"] / 11.6e-3 < 1.15
     assert 0.8 < found["NCFM"]["windows"]["5"]["all"] / 6.1e-3 < 1.15
 
 
-def test_file_names_of_older_systems_lose_nothing(bench: Path, tmp_path: Path) -> None:
+def test_file_names_in_legacy_encodings_lose_nothing(bench: Path, tmp_path: Path) -> None:
     files = [tmp_path / os.fsdecode(f"Gelenk_{x}_ä.csv".encode("latin-1")) for x in "ab"]
     for path, name in zip(files, ("a.csv.gz", "b.csv"), strict=True):
         Recording.read(bench / name).write(path)

@@ -1,4 +1,4 @@
-"""`export` and `verify`: a model file to every target, and a verdict by the exit status."""
+"""`export` and `verify`: a model file to every target, and the verdict as exit status."""
 
 import argparse
 import json
@@ -35,30 +35,30 @@ def run_verify(*words: Any) -> int:
     return int(arguments.run(arguments))
 
 
-def test_to_controllers_and_back(
+def test_export_to_controllers_and_verification(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     limits = ",".join(["3"] * RIG.joints)
     words = ["--format", "torchscript,c", "--out", str(out), "--torque-limit", limits]
     assert cli.main(["export", str(model), *words]) == 0
-    said = capsys.readouterr().out
-    assert str(out / "lfm.pt") in said
+    printed = capsys.readouterr().out
+    assert str(out / "lfm.pt") in printed
     artefacts = [out / "lfm.pt", *([out / "lfm.c"] if find_compiler() else [])]
     for artefact in artefacts:
         assert run_verify(artefact, model, "--points", 300) == 0
-        said = capsys.readouterr().out
-        assert "drawn points" in said
-        assert f"{artefact.name} is lfm.json" in said
-    # Not the TorchScript file, which a process of its own runs, if there is a C compiler.
+        printed = capsys.readouterr().out
+        assert "drawn points" in printed
+        assert f"{artefact.name} is lfm.json" in printed
+    # Without the TorchScript file, which runs in a separate process if there is a C compiler.
     other = save(LFM(RIG.joints, [1.0, 1.0]), tmp_path / "other.json")
     assert run_verify(artefacts[-1], other) == 1
-    said = capsys.readouterr().out
-    assert "DIFFERENT" in said
-    assert f"{artefacts[-1].name} IS NOT other.json" in said
+    printed = capsys.readouterr().out
+    assert "DIFFERENT" in printed
+    assert f"{artefacts[-1].name} IS NOT other.json" in printed
 
 
-def test_the_papers_network_is_also_written_to_learn_online(
+def test_paper_network_is_also_exported_for_online_learning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = save(NFLFM(2, network="rbf"), tmp_path / "arm.json")
@@ -76,7 +76,7 @@ def test_the_papers_network_is_also_written_to_learn_online(
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 def test_two_exports_link_into_one_program(tmp_path: Path) -> None:
-    """By default names, which are those of the model files; one is a word of C."""
+    """Also with default names, those of the model files; one is a C keyword."""
     torques = {"upper-arm 2": "upper_arm_2", "int": "nf_int"}
     for scale, (stem, name) in enumerate(torques.items(), 1):
         path = save(LFM(1, [0.1 * scale, 0.0]), tmp_path / f"{stem}.json")
@@ -97,7 +97,7 @@ def test_two_exports_link_into_one_program(tmp_path: Path) -> None:
     assert subprocess.run([tmp_path / "both"], check=False).returncode == 30
 
 
-def test_exported_c_is_run_or_said_not_to_be(
+def test_exported_c_is_run_or_reported_as_not_run(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["export", str(model), "--format", "c", "--out", str(tmp_path / "out")]
@@ -117,26 +117,28 @@ def test_exported_c_is_run_or_said_not_to_be(
 @pytest.mark.parametrize(
     "targets", ["torchscript,c", pytest.param("pt2,onnx", marks=pytest.mark.slow)]
 )
-def test_artefacts_beside_a_model_leave_it_whole(model: Path, targets: str) -> None:
+def test_artefacts_in_the_folder_of_a_model_do_not_overwrite_it(model: Path, targets: str) -> None:
     before = model.read_bytes()
     assert cli.main(["export", str(model), "--format", targets, "--out", str(model.parent)]) == 0
     assert model.read_bytes() == before
 
 
-def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_to_simulators(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     time = 1e-3 * np.arange(2000)
     phase = 5 * time[:, None] + np.arange(RIG.joints)
     recording = Recording(time, np.sin(phase), names=tuple(RIG.joint_names))
     recording.write(tmp_path / "run.csv")
     words = ["--format", "mjcf,urdf", "--recording", str(tmp_path / "run.csv")]
     assert cli.main(["export", str(model), *words, "--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert said.count("RMS") == 2 * RIG.joints
+    printed = capsys.readouterr().out
+    assert printed.count("RMS") == 2 * RIG.joints
     for name in ("lfm.xml", "lfm.urdf"):
         assert RIG.joint_names[0] in (tmp_path / name).read_text()
 
 
-def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
+def test_recording_in_degrees_with_own_names_gives_the_same_result(
     model: Path, tmp_path: Path
 ) -> None:
     time = 1e-3 * np.arange(2000)
@@ -190,7 +192,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--online", "0.1,0.2", "--format", "c"], "--online: must be one number"),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_impossible_exports_are_refused(
     model: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [word.replace("model.json", str(model)) for word in words]
@@ -200,7 +202,7 @@ def test_what_cannot_be_done_is_said(
 
 
 @pytest.mark.parametrize("length", [25, 31])
-def test_a_name_is_that_of_all_files(model: Path, tmp_path: Path, length: int) -> None:
+def test_name_is_used_for_all_files(model: Path, tmp_path: Path, length: int) -> None:
     name, words = length * "a", ["--format", "c,torchscript", "--out", str(tmp_path / "out")]
     assert cli.main(["export", str(model), "--name", name, *words]) == 0
     assert {path.name.partition(".")[0] for path in (tmp_path / "out").iterdir()} == {
@@ -208,15 +210,15 @@ def test_a_name_is_that_of_all_files(model: Path, tmp_path: Path, length: int) -
     }  # fmt: skip
 
 
-def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
+def test_filter_is_included(model: Path, tmp_path: Path) -> None:
     words = ["--with-filter", "--cutoff", "30", "--format", "c", "--out", str(tmp_path / "out")]
     assert cli.main(["export", str(model), *words]) == 0
-    told = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
-    assert told["filter"]["cutoff_hz"] == 30.0
+    contract = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
+    assert contract["filter"]["cutoff_hz"] == 30.0
 
 
 @pytest.mark.parametrize("suffix", [".c", ".pt"])
-def test_a_controller_may_run_at_another_rate_than_the_recordings(
+def test_controller_rate_may_differ_from_the_recordings(
     model: Path, tmp_path: Path, suffix: str
 ) -> None:
     if suffix == ".c" and not find_compiler():

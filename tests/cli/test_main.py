@@ -1,4 +1,4 @@
-"""The command line before it does any work: help, errors, names, and how fast they come."""
+"""The command line before any computation: help, errors, names, and start-up time."""
 
 import argparse
 import logging
@@ -27,7 +27,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def example(parser: argparse.ArgumentParser) -> list[str]:
-    """The words of the command with which a help ends."""
+    """The arguments of the command at the end of a help text."""
     block = parser.format_help().partition("\nexample:\n")[2].partition("\n\n")[0]
     return block.replace("\\\n", " ").split()
 
@@ -43,7 +43,7 @@ def test_a_console_shows_each_kind_of_message_once() -> None:
     assert shown == [True, False, True, True, True, True]
 
 
-def test_names_are_those_of_the_library() -> None:
+def test_model_names_are_those_of_the_library() -> None:
     assert rigs.names() == list(inputs.RIGS)
     assert inputs.models(inputs.DEFAULT_MODELS) == ["NCFM", "LFM", "NLFM", "Stribeck", "NFLFM"]
     assert (".json", ".toml", *robot_file.ENDINGS) == inputs.RIG_FILES
@@ -59,14 +59,18 @@ def test_help_explains_every_option_and_ends_with_an_example(name: str) -> None:
     assert example(parser)[:2] == ["nfriction", name]
     for action in parser._actions:
         if action.option_strings and action.default not in (None, False, [], "==SUPPRESS=="):
-            told = parser._get_formatter()._expand_help(action)
+            help_text = parser._get_formatter()._expand_help(action)
             in_words = "(default: " in action.help
-            assert told.count("(default: ") == 1, f"{name} {action.dest} gives its default twice"
-            assert in_words or f"(default: {action.default})" in told
+            assert help_text.count("(default: ") == 1, (
+                f"{name} {action.dest} gives its default twice"
+            )
+            assert in_words or f"(default: {action.default})" in help_text
 
 
 @pytest.mark.parametrize("name", list(commands()))
-def test_examples_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_in_help_texts_parse(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = example(commands()[name])[1:]
     monkeypatch.chdir(tmp_path)
     for file in (Path(word) for word in words if word.endswith((".csv", ".json"))):
@@ -111,9 +115,9 @@ def test_installed_command_fails_in_one_line() -> None:
     assert re.fullmatch(r"nfriction: error: .*absent\.csv.*\n", done.stderr)
 
 
-def test_advice_for_python_becomes_that_for_the_command_line() -> None:
-    told = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
-    assert one_line(told) == "torques are late (--fit-delay). Corrected"
+def test_python_advice_is_translated_to_command_line_options() -> None:
+    advice = "torques are late (`fit_delay=True`, or `recording.advance_torque(-0.03)`). Corrected"
+    assert one_line(advice) == "torques are late (--fit-delay). Corrected"
     assert one_line('not: `encoder_reference="shared"`') == "not: --encoder-reference shared"
     assert one_line("`columns` or `degrees=True`") == "--columns or --degrees"
 
@@ -125,7 +129,7 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (["--windows", "0"], "--windows: must be positive"),
         (["--windows=-1"], "--windows: must be positive"),
@@ -144,13 +148,13 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
         (["--initial-states", "absent.csv"], "absent.csv"),
     ],
 )
-def test_options_that_make_no_sense(bench: Path, failing, more: list[str], said: str) -> None:
+def test_invalid_options_are_refused(bench: Path, failing, more: list[str], message: str) -> None:
     words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--out", bench / "bad"]
-    assert said in failing(*words, *more)
+    assert message in failing(*words, *more)
     assert not (bench / "bad").exists()
 
 
-def test_folders_and_files_in_the_way(bench: Path, failing) -> None:
+def test_output_paths_blocked_by_files_are_refused(bench: Path, failing) -> None:
     words = [bench / "a.csv.gz", "--rig", bench / "bench.json", "--out"]
     for out in (bench / "b.csv", bench / "b.csv" / "under"):
         assert "in its way" in failing("compare", *words, out)
@@ -158,14 +162,16 @@ def test_folders_and_files_in_the_way(bench: Path, failing) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root writes anywhere")
-def test_folder_that_must_not_be_written(bench: Path, failing) -> None:
+def test_read_only_folder_is_refused(bench: Path, failing) -> None:
     locked = bench / "locked"
     locked.mkdir(mode=0o500)
     words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--out", locked]
     assert "ermission denied" in failing(*words)
 
 
-def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, failing) -> None:
+def test_export_info_and_demo_refuse_unsupported_requests(
+    bench: Path, compared: Path, failing
+) -> None:
     for command in ("export", "info"):
         assert "check the path" in failing(command, bench / "absent.json")
         assert "model file" in failing(command, bench / "bench.json")
@@ -196,5 +202,5 @@ def test_a_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path:
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, timeout=60, env=env)
     os.close(writer)
     assert done.stderr == b""
-    # argparse of some Python versions drops its own failure to write.
+    # argparse of some Python versions ignores its own write errors.
     assert done.returncode in ({0, 141} if unbuffered and "--version" in words else {141})

@@ -1,4 +1,4 @@
-"""`nfriction report` as a user meets it."""
+"""`nfriction report` as a user runs it."""
 
 import shutil
 from pathlib import Path
@@ -21,14 +21,14 @@ def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> 
     assert "nfriction compare" in html
 
 
-def test_the_page_lies_in_the_folder_by_default(compared: Path) -> None:
+def test_page_is_written_to_the_folder_by_default(compared: Path) -> None:
     assert cli.main(["report", str(compared)]) == 0
     first = (compared / "report.html").read_bytes()
     assert cli.main(["report", str(compared)]) == 0
     assert (compared / "report.html").read_bytes() == first
 
 
-def test_what_is_no_run_is_refused_in_a_line(
+def test_folder_without_a_run_is_refused_in_one_line(
     bench: Path, compared: Path, tmp_path, failing
 ) -> None:
     assert "no folder" in failing("report", tmp_path / "absent")
@@ -39,7 +39,7 @@ def test_what_is_no_run_is_refused_in_a_line(
     assert not (tmp_path / "report.html").exists()
 
 
-def test_a_missing_model_is_warned_of(tmp_path: Path, compared: Path, capsys) -> None:
+def test_missing_model_raises_a_warning(tmp_path: Path, compared: Path, capsys) -> None:
     (tmp_path / "results.json").write_bytes((compared / "results.json").read_bytes())
     assert cli.main(["report", str(tmp_path)]) == 0
     assert "warning: NCFM: its model file could not be read" in capsys.readouterr().err
@@ -65,9 +65,7 @@ def test_files_of_two_runs_are_refused(
     assert "files of two runs: models/NCFM.json" in failing("report", tmp_path)
 
 
-def test_a_run_that_was_killed_at_its_end_is_completed(
-    compared: Path, tmp_path: Path, capsys
-) -> None:
+def test_run_killed_at_its_end_is_completed(compared: Path, tmp_path: Path, capsys) -> None:
     whole = tmp_path / "whole"
     shutil.copytree(compared, whole / COMPLETE)
     assert cli.main(["report", str(whole)]) == 0

@@ -1,4 +1,4 @@
-"""Compiled code goes to a cache of the test run's own, shared so that it is built only once."""
+"""Send compiled code to a cache of this test run, shared so that it is built only once."""
 
 import pytest
 

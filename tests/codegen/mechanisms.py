@@ -73,7 +73,7 @@ class Coulomb(nn.Module):
 
 
 class NeuroFuzzy(Coulomb):
-    """Rules over speed and acceleration, refined by a radial head, one set a joint."""
+    """Rules over speed and acceleration, refined by a radial-basis head; one set per joint."""
 
     def __init__(self, joints: int = 3, terms: int = 5, units: int = 10) -> None:
         super().__init__(joints)

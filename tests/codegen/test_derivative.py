@@ -43,7 +43,7 @@ def program(function, *inputs):
 
 
 def jacobian(function, *inputs, wrt=None):
-    """By the rules, evaluated in NumPy."""
+    """Jacobian by the differentiation rules, evaluated in NumPy."""
     names = [f"x{i}" for i in (range(len(inputs)) if wrt is None else wrt)]
     port = with_jacobian(program(function, *inputs), names).outputs[-1]
     given = {f"x{i}": x.reshape(-1).numpy() for i, x in enumerate(inputs)}
@@ -57,7 +57,7 @@ def test_every_rule_has_a_case():
 @pytest.mark.parametrize("name", RULES)
 @pytest.mark.parametrize("frozen", [None, 0, 1])
 def test_rules_agree_with_torch_and_finite_differences(name, frozen):
-    """Both operands moving, and each alone: rules treat a resting operand apart."""
+    """Both operands vary, then each alone: rules treat a constant operand separately."""
     function = RULES[name]
     wrt = [i for i in (0, 1) if i != frozen]
     found = jacobian(function, X, Y, wrt=wrt)
@@ -73,7 +73,7 @@ def test_rules_agree_with_torch_and_finite_differences(name, frozen):
     torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-7, atol=1e-8)
 
 
-def test_a_variable_met_twice_and_a_composition():
+def test_repeated_variables_and_compositions_are_differentiated():
     def function(x, y):
         z = x * x / (1 + y.exp()) - (x / y)
         return torch.atan(z * z).sum() * z.cos()
@@ -82,13 +82,13 @@ def test_a_variable_met_twice_and_a_composition():
     torch.testing.assert_close(jacobian(function, X, Y), exact, rtol=1e-13, atol=1e-13)
 
 
-def test_inputs_passed_through_and_outputs_without_dependence():
+def test_identity_and_constant_outputs_have_correct_jacobians():
     found = jacobian(lambda x, y: (x, y.sin(), torch.ones_like(x)), X, Y, wrt=[0])
     eye, zero = torch.eye(4, dtype=torch.float64), torch.zeros(4, 4, dtype=torch.float64)
     assert torch.equal(found, torch.cat([eye, zero, zero]))
 
 
-def test_directions_that_do_not_matter_cost_nothing():
+def test_directions_without_effect_add_no_operations():
     traced = program(lambda x, y: x.sin() * x.exp(), X, Y)
     outputs = traced.outputs[0].nodes
     size = len(traced.graph)
@@ -101,7 +101,7 @@ def test_directions_that_do_not_matter_cost_nothing():
     assert all(node.op == "constant" and node.value == 0.0 for node in jacobian.nodes)
 
 
-def test_an_operation_without_a_rule_is_named_only_where_it_matters():
+def test_missing_rule_raises_only_if_its_operation_is_differentiated():
     with pytest.raises(UnsupportedOperation, match=r"`atan2`.*derivative"):
         jacobian(torch.atan2, X, Y)
 
@@ -123,7 +123,7 @@ def test_conditions_have_no_derivative():
         assert value == slope
 
 
-def test_compiled_jacobians_are_batched_and_come_last():
+def test_compiled_jacobian_is_batched_and_is_the_last_output():
     def function(x, y):
         return x.tanh() * y.sum(), (x * x).sum()[None]
 

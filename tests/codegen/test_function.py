@@ -1,4 +1,4 @@
-"""Single functions: compiled equals eager."""
+"""Compiled single functions equal eager ones."""
 
 import re
 
@@ -45,7 +45,7 @@ def test_every_operation_agrees():
     np.testing.assert_allclose(compiled(x, y), expected.numpy(), rtol=1e-13, atol=1e-15)
 
 
-def test_truth_values_are_numbers_where_numbers_are_wanted():
+def test_booleans_act_as_numbers_in_arithmetic():
     def f(x):
         above = x > 0
         counted = above.to(F64) * (x < 2)
@@ -57,7 +57,7 @@ def test_truth_values_are_numbers_where_numbers_are_wanted():
         np.testing.assert_array_equal(ours[0], expected.numpy().astype(float))
 
 
-def test_nan_and_infinity_pass_as_in_torch():
+def test_nan_and_infinity_propagate_as_in_torch():
     def f(x, y):
         return torch.stack([torch.maximum(x, y), torch.minimum(x, y), x.clamp(-1.0, 1.0), 1 / x])
 
@@ -114,7 +114,7 @@ def test_random_graphs_agree(lines):
     np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-10)  # chains of 20 products
 
 
-def test_emitted_code_is_the_same_every_time():
+def test_emitted_code_is_deterministic():
     inputs = [torch.ones(2, dtype=F64), torch.ones(2, dtype=F64)]
     a, b = (CompiledFunction(NeuroFuzzy(2).coefficients, inputs) for _ in range(2))
     assert a.kernel.source() == b.kernel.source()
@@ -122,7 +122,7 @@ def test_emitted_code_is_the_same_every_time():
 
 
 @pytest.mark.parametrize("rows", [2, 3, 8, 21])
-def test_rows_computed_together_have_the_bits_of_single_ones(rows):
+def test_batched_rows_equal_single_rows_bit_for_bit(rows):
     compiled = CompiledFunction(everything, torch.randn(2, 3, dtype=F64).unbind())
     x, y = np.random.default_rng(2).normal(size=(2, rows, 3))
     together = compiled(x, y)
@@ -130,24 +130,24 @@ def test_rows_computed_together_have_the_bits_of_single_ones(rows):
         np.testing.assert_array_equal(compiled(x[i : i + 1], y[i : i + 1])[0], together[i])
 
 
-def test_all_functions_of_the_library_are_known_to_the_loader():
-    """On Windows LLVM finds none of them by itself."""
+def test_loader_resolves_all_maths_functions():
+    """LLVM on Windows resolves none of them by itself."""
     compiled = CompiledFunction(everything, torch.randn(2, 3, dtype=F64).unbind())
     called = set(re.findall(r"declare double @([a-z0-9]+)\(", compiled.kernel.source()))
     assert called <= set(jit.LIBRARY)
     assert {"fmod", "pow", "log1p"} - called == {"fmod"}  # a remainder is LLVM's own instruction
 
 
-def test_jacobians_are_checked_where_their_inputs_have_the_signs_of_the_example(monkeypatch):
-    """A stiffness below zero or a step back in time may grow without bound, and then only noise."""
+def test_jacobian_self_check_uses_inputs_with_the_signs_of_the_example(monkeypatch):
+    """Negative stiffness or time steps may diverge, and the check would compare noise."""
     checked = []
     eager = CompiledFunction._eager
 
-    def kept(self, inputs):
+    def recorded(self, inputs):
         checked.extend(inputs)
         return eager(self, inputs)
 
-    monkeypatch.setattr(CompiledFunction, "_eager", kept)
+    monkeypatch.setattr(CompiledFunction, "_eager", recorded)
     small, size = torch.full((50,), 1e-3, dtype=F64), torch.full((50,), -3.0, dtype=F64)
     CompiledFunction(lambda x, y: (x * y).sum()[None], (small, size), jacobian=(0, 1))
     assert (checked[0] > 0).all()

@@ -13,7 +13,7 @@ F64 = torch.float64
 
 
 def traced(function, *examples):
-    """Values of the traced function at inputs other than those it was traced with."""
+    """Values of the traced function at inputs other than its trace inputs."""
     names = [f"x{i}" for i in range(len(examples))]
     program = trace(
         lambda **inputs: function(*(inputs[n] for n in names)),
@@ -256,7 +256,7 @@ def test_nan_propagates_as_in_torch():
         np.testing.assert_array_equal(traced(f, x, y)[0], f(x, y).numpy())
 
 
-def test_the_same_tensor_twice_is_two_inputs():
+def test_same_tensor_passed_twice_is_two_inputs():
     x = torch.tensor([1.0, 2.0], dtype=F64)
     program = trace(lambda a, b: a - 2 * b, {"a": x, "b": x})
     a, b = np.array([5.0, 7.0]), np.array([1.0, 10.0])
@@ -264,7 +264,7 @@ def test_the_same_tensor_twice_is_two_inputs():
     np.testing.assert_array_equal(got, a - 2 * b)
 
 
-def test_tracing_leaves_the_examples_alone():
+def test_tracing_does_not_modify_example_inputs():
     x = torch.ones(3, dtype=F64)
     trace(lambda a: a.mul_(2.0).add_(1.0), {"a": x})
     assert torch.equal(x, torch.ones(3, dtype=F64))
@@ -283,7 +283,7 @@ def test_tracing_leaves_the_examples_alone():
         (lambda x: x.float() * 2, "float32"),
     ],
 )
-def test_what_cannot_be_compiled_is_named_with_the_way_out(function, named):
+def test_unsupported_code_raises_error_with_remedy(function, named):
     with pytest.raises(UnsupportedOperation, match=r'backend="torch"') as error:
         trace(function, {"x": X})
     assert named in str(error.value)
@@ -294,12 +294,12 @@ def test_a_model_too_large_to_unroll_is_refused():
         trace(lambda x: torch.outer(x, x), {"x": torch.ones(int(LIMIT**0.5) + 2, dtype=F64)})
 
 
-def test_single_precision_is_refused_with_the_mend():
+def test_single_precision_is_refused_with_remedy():
     with pytest.raises(ValueError, match=r"double\(\)"):
         trace(lambda x: x, {"x": torch.ones(2)})
 
 
-def test_a_constant_may_be_asked_for():
+def test_constant_outputs_are_supported():
     program = trace(lambda x: x * (2.0 if torch.ones(()).item() > 0 else 3.0), {"x": X})
     np.testing.assert_array_equal(
         evaluate(program.outputs[0].nodes, {"x": X.numpy()}), 2 * X.numpy()

@@ -1,4 +1,4 @@
-"""Hoisting moves work to where it is done less often and changes nothing else."""
+"""Hoisting moves work to where it runs less often and changes no value."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ def example():
     return g, g.total([product, ratio, g.apply("mul", mixed, x)])
 
 
-def test_no_operation_is_left_in_the_step_that_only_needs_parameters():
+def test_parameter_only_operations_leave_the_step():
     g, out = example()
     (step,), once = hoist(g, [[out]])
     for node in reachable(step, once):
@@ -25,15 +25,15 @@ def test_no_operation_is_left_in_the_step_that_only_needs_parameters():
     assert {n.op for n in once} == {"mul", "div"}
 
 
-def test_regrouping_keeps_the_value():
+def test_regrouping_preserves_the_value():
     g, out = example()
     rng = np.random.default_rng(1)
     inputs = {"p": rng.uniform(1, 2, (9, 3)), "x": rng.normal(size=(9, 2))}
     before, after = evaluate([out, *hoist(g, [[out]])[0][0]], inputs)
-    np.testing.assert_allclose(after, before, rtol=1e-14)  # a few roundings
+    np.testing.assert_allclose(after, before, rtol=1e-14)  # a few rounding errors
 
 
-def test_outputs_of_any_rate_are_found():
+def test_outputs_of_every_update_rate_are_collected():
     g = Graph()
     p, x = g.input("p", 0, UpdateRate.PARAMETER), g.input("x", 0)
     outputs = [g.constant(2.0), p, g.apply("exp", p), g.apply("sin", x)]

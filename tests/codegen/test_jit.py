@@ -1,4 +1,4 @@
-"""Machine code is made without a compiler; the cache is safe, private and reused."""
+"""Machine code needs no C compiler; its cache is safe, private and reused."""
 
 import errno
 import logging
@@ -40,7 +40,7 @@ def objects(folder):
     return sorted(p.name for p in folder.iterdir() if p.suffix == ".object")
 
 
-def test_code_is_made_once_and_reused(cache, monkeypatch):
+def test_code_is_compiled_once_and_reused(cache, monkeypatch):
     assert answer() == 42
     made = objects(cache)
     assert len(made) == 1
@@ -55,7 +55,7 @@ def test_code_is_made_once_and_reused(cache, monkeypatch):
 
 
 @pytest.mark.parametrize("content", [b"", b"not code", None])
-def test_damaged_code_is_made_anew(cache, content):
+def test_damaged_code_is_recompiled(cache, content):
     answer()
     (name,) = objects(cache)
     whole = (cache / name).read_bytes()
@@ -65,7 +65,7 @@ def test_damaged_code_is_made_anew(cache, content):
 
 
 @pytest.mark.parametrize("changed", ["_processor", "_version"])
-def test_code_of_another_machine_or_version_is_not_taken(cache, monkeypatch, changed):
+def test_code_of_another_machine_or_version_is_not_used(cache, monkeypatch, changed):
     answer()
     own = getattr(jit, changed)()
     other = ("some-cpu", own[1]) if changed == "_processor" else "0.0"
@@ -86,7 +86,7 @@ def test_the_cache_folder_is_private(cache):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="owners of POSIX")
-def test_a_cache_folder_of_somebody_else_is_refused(cache, monkeypatch):
+def test_cache_folder_of_another_user_is_refused(cache, monkeypatch):
     jit.cache_folder()
     monkeypatch.setattr(jit.os, "getuid", lambda: cache.stat().st_uid + 1)
     with pytest.raises(PermissionError, match="belong to you"):
@@ -94,7 +94,7 @@ def test_a_cache_folder_of_somebody_else_is_refused(cache, monkeypatch):
 
 
 @pytest.mark.parametrize("obstacle", ["open to others", "a file", "full", "read-only"])
-def test_without_a_usable_cache_code_is_made_in_memory(cache, monkeypatch, caplog, obstacle):
+def test_without_a_usable_cache_code_is_compiled_in_memory(cache, monkeypatch, caplog, obstacle):
     if obstacle == "a file":
         cache.write_text("")
     elif obstacle == "open to others":
@@ -134,7 +134,7 @@ def test_without_the_override_the_platforms_cache_is_used(tmp_path, monkeypatch)
     assert tmp_path in folder.parents
 
 
-def test_without_a_home_code_is_made_in_memory(monkeypatch, caplog):
+def test_without_a_home_code_is_compiled_in_memory(monkeypatch, caplog):
     def homeless():
         raise RuntimeError("Could not determine home directory.")
 
@@ -180,7 +180,7 @@ def ends():
 
 
 def test_neither_a_compiler_nor_numba_is_needed(cache, tmp_path, monkeypatch):
-    """A fresh process with an empty PATH and no numba; another takes the code as it is."""
+    """A fresh process with an empty PATH and no numba compiles; a second one reuses its code."""
     script = f"import sys; sys.modules['numba'] = None\n{SWINGS}\nprint(ends())"
     environment = dict(os.environ, PATH=str(tmp_path)) | {"CC": ""}
     run = subprocess.run(

@@ -1,4 +1,4 @@
-"""Compiled rollouts are those of eager torch."""
+"""Compiled rollouts equal those of eager torch."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from nfriction.codegen import SelfCheckFailed, UnsupportedOperation, ir
 from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from tests.codegen.mechanisms import F64, Coulomb, NeuroFuzzy, Pendulum, reference
 
-# Rounding differs by an ulp or two a step; a second of a falling chain amplifies that tenfold.
+# Rounding differs by an ulp or two per step; one second of a falling chain amplifies it tenfold.
 TOLERANCE = {"rtol": 0.0, "atol": 1e-12}
 
 
@@ -20,14 +20,14 @@ class Motion(NamedTuple):
     q: torch.Tensor
     qd: torch.Tensor
     qdd: torch.Tensor
-    diverged_at: torch.Tensor  # sample, -1 where it did not
+    diverged_at: torch.Tensor  # sample index, -1 if it did not diverge
 
 
 def run(
     compiled, q0, qd0, *, steps, time_step, tau=None, drive=None, substeps=1, memory=None,
     parameters=None, threads=1,
 ):  # fmt: skip
-    """Rollouts of compiled code, with what drives them given by name."""
+    """Rollouts of compiled code; torque, drive and stamps are passed by name."""
     step = torch.as_tensor(time_step, dtype=F64)
     step = step if step.ndim else step.expand(steps)
     tau = torch.zeros(q0.shape[-1], dtype=F64).expand(steps, -1) if tau is None else tau
@@ -147,8 +147,8 @@ def test_threads_change_nothing(coulomb):
 
 @pytest.mark.parametrize("model", ["coulomb", "neurofuzzy"])
 @pytest.mark.parametrize("batch", [2, 3, 8, 13])
-def test_a_batch_has_the_bits_of_its_candidates(model, batch, request):
-    """Several candidates are computed together, with torque, stamps and a drive of their own."""
+def test_batch_equals_its_candidates_bit_for_bit(model, batch, request):
+    """Several candidates are computed together, each with its own torque, stamps and drive."""
     _, _, compiled = request.getfixturevalue(model)
     q, qd = start(batch=batch)
     g = torch.Generator().manual_seed(4)
@@ -210,7 +210,7 @@ def test_rk4_converges_with_order_four(coulomb):
     assert np.all(np.abs(slopes - 4) < 0.3)
 
 
-def test_torque_of_its_own_may_stop_a_candidate_among_many():
+def test_infinite_torque_stops_only_its_candidate():
     plant, friction = Pendulum(2), Coulomb(2)
     compiled = compile_rollout(plant, friction)
     q, qd = start(2, batch=11)
@@ -227,8 +227,8 @@ def test_torque_of_its_own_may_stop_a_candidate_among_many():
     np.testing.assert_array_equal(stopped.q[others], got.q[others])
 
 
-def test_inputs_are_read_where_they_are(coulomb):
-    """Transposed, strided and repeated arrays give what their copies give."""
+def test_strided_inputs_are_read_without_copies(coulomb):
+    """Transposed, strided and repeated arrays give the same results as their copies."""
     _, _, compiled = coulomb
     q, qd = start(batch=4)
     tau = torch.randn(3, 4, 80, dtype=F64).permute(1, 2, 0)[:, ::2]
@@ -239,12 +239,12 @@ def test_inputs_are_read_where_they_are(coulomb):
     )
 
 
-def test_the_same_model_gives_the_same_source(coulomb):
+def test_source_code_is_deterministic(coulomb):
     _, _, compiled = coulomb
     assert compile_rollout(Pendulum(), Coulomb()).kernel.source() == compiled.kernel.source()
 
 
-def test_nothing_that_only_needs_parameters_is_computed_in_the_steps(coulomb):
+def test_parameter_only_operations_are_computed_once(coulomb):
     _, _, compiled = coulomb
     functions = {
         part.split("(")[0]: part for part in compiled.kernel.source().split("define internal ")
@@ -265,15 +265,15 @@ def test_nothing_that_only_needs_parameters_is_computed_in_the_steps(coulomb):
         ({"drive": (torch.ones(5, 3), torch.ones(4, 3))}, "`measured` must be"),
     ],
 )
-def test_bad_arguments_are_told(coulomb, change, message):
+def test_bad_arguments_raise_clear_errors(coulomb, change, message):
     _, _, compiled = coulomb
     given = {"q0": torch.ones(2, 3), "qd0": torch.ones(2, 3), "steps": 5, "time_step": 1e-3}
     with pytest.raises(ValueError, match=message):
         run(compiled, **{**given, **change})
 
 
-class Remembering(Coulomb):
-    """Friction that grows with the path travelled, a memory of one number a joint."""
+class PathDependent(Coulomb):
+    """Friction that grows with the distance travelled, one hidden state per joint."""
 
     state_size = 1
 
@@ -290,12 +290,12 @@ class Remembering(Coulomb):
         return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
 
 
-def test_a_memory_agrees_with_eager_steps():
-    plant, friction = Pendulum(2), Remembering(2)
+def test_hidden_state_agrees_with_eager_steps():
+    plant, friction = Pendulum(2), PathDependent(2)
     compiled = compile_rollout(plant, friction)
 
-    class Replayed(Coulomb):
-        """The same friction for `reference`, which calls once a step."""
+    class ReferencePathDependent(Coulomb):
+        """The same friction for `reference`, which calls it once per step."""
 
         state = None
 
@@ -308,7 +308,7 @@ def test_a_memory_agrees_with_eager_steps():
 
     q, qd = start(2, batch=2)
     got = run(compiled, q, qd, steps=1000, time_step=1e-3)
-    assert_same(got, reference(plant, Replayed(2), q, qd, 1000, 1e-3))
+    assert_same(got, reference(plant, ReferencePathDependent(2), q, qd, 1000, 1e-3))
     memory = torch.tensor([[[5.0], [1.0]], [[0.0], [9.0]]], dtype=F64)
     given = run(compiled, q, qd, steps=50, time_step=1e-3, memory=memory, threads=2)
     for i in range(2):
@@ -334,7 +334,7 @@ def test_wrong_code_fails_the_self_check(monkeypatch):
         compile_rollout(Pendulum(2), Coulomb(2))
 
 
-def test_an_unknown_operation_names_itself_and_the_fallback():
+def test_unknown_operation_error_names_it_and_the_fallback():
     class Sorted(Coulomb):
         def torque(self, qd, load, c):
             return super().torque(qd.sort(-1).values, load, c)
@@ -343,6 +343,6 @@ def test_an_unknown_operation_names_itself_and_the_fallback():
         compile_rollout(Pendulum(), Sorted())
 
 
-def test_what_is_no_module_is_refused():
+def test_objects_that_are_no_modules_are_refused():
     with pytest.raises(TypeError, match="friction"):
         compile_rollout(Pendulum(), object())

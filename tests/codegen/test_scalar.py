@@ -16,7 +16,7 @@ VALUES = (0.0, 1.0, -1.0, 2.0, 0.5, -0.5, 3.0)
 
 @st.composite
 def recipes(draw):
-    """Straight-line programs: each line names an operation and earlier lines."""
+    """Straight-line programs: each line names an operation and earlier lines as its operands."""
     size = draw(st.integers(1, 25))
     lines = []
     for i in range(size):
@@ -58,11 +58,11 @@ def build(lines):
 
 @given(recipes())
 @settings(max_examples=150, deadline=None)
-def test_simplified_graph_keeps_the_value(lines):
+def test_simplification_preserves_the_value(lines):
     node, expected, x = build(lines)
     got = np.broadcast_to(evaluate([node], {"x": x})[0], expected.shape)
     finite = np.isfinite(expected)  # 0 * inf may become 0, as a written zero means "no coupling"
-    # Integer powers are multiplied out, which rounds a few times and is then amplified.
+    # Integer powers are expanded into products; their rounding errors are then amplified.
     np.testing.assert_allclose(got[finite], expected[finite], rtol=1e-9, atol=1e-9)
 
 
@@ -79,7 +79,7 @@ def test_equal_operations_share_a_node():
 @pytest.mark.parametrize(
     ("op", "value"), [("mul", 1.0), ("add", 0.0), ("sub", 0.0), ("div", 1.0), ("pow", 1.0)]
 )
-def test_neutral_elements_vanish(op, value):
+def test_neutral_elements_are_removed(op, value):
     g = Graph()
     x = g.input("x", 0)
     assert g.apply(op, x, g.constant(value)) is x
@@ -93,21 +93,21 @@ def test_constants_fold_like_numpy_even_where_python_would_raise():
     assert g.apply("exp", g.constant(1e4)).value == math.inf
 
 
-def test_signed_zero_and_nan_are_told_apart():
+def test_signed_zeros_and_nan_are_distinguished():
     g = Graph()
     assert g.constant(-0.0) is not g.constant(0.0)
     assert g.constant(math.nan) is g.constant(math.nan)
     assert g.constant(True) is not g.constant(1.0)
 
 
-def test_a_value_is_computed_as_often_as_its_most_volatile_argument():
+def test_update_rate_is_that_of_the_most_volatile_argument():
     g = Graph()
     p, x = g.input("p", 0, UpdateRate.PARAMETER), g.input("x", 0)
     assert g.apply("mul", p, g.constant(2.0)).rate == UpdateRate.PARAMETER
     assert g.apply("mul", g.apply("exp", p), x).rate == UpdateRate.STEP
 
 
-def test_reachable_lists_arguments_first_and_leaves_dead_code_out():
+def test_reachable_lists_arguments_first_and_omits_dead_code():
     g = Graph()
     x = g.input("x", 0)
     dead = g.apply("exp", x)

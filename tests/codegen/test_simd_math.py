@@ -1,4 +1,4 @@
-"""exp, tanh, sin and cos of vectors are the library's, to a few units in the last place."""
+"""Vectorised exp, tanh, sin and cos equal the maths library's to a few ulp."""
 
 import numpy as np
 import pytest
@@ -60,24 +60,25 @@ def test_errors_stay_below_three_units_in_the_last_place(functions, op, exact, s
         assert units.max() < 3
 
 
-def test_special_values_are_the_librarys(functions):
+def test_special_values_equal_the_librarys(functions):
     x = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e300, -1e300, 800.0])
     with np.errstate(all="ignore"):
         for op, exact in (("tanh", np.tanh), ("sin", np.sin), ("cos", np.cos)):
             np.testing.assert_array_equal(functions(op, x), exact(x))
         assert np.signbit(functions("tanh", x)[4])
-        # Below -708, where the library still counts down to 1e-324, the result stops at 1e-308.
+        # Below -708, where the library still returns denormals down to 1e-324, the result stops at
+        # 1e-308.
         np.testing.assert_allclose(functions("exp", x), np.exp(x), atol=1e-307)
 
 
-def test_quarter_turns_keep_their_relative_accuracy(functions):
+def test_relative_accuracy_is_kept_near_multiples_of_pi_over_two(functions):
     x = np.arange(1, 4001) * (np.pi / 2)
     np.testing.assert_allclose(functions("sin", x), np.sin(x), rtol=1e-15)
     np.testing.assert_allclose(functions("cos", x), np.cos(x), rtol=1e-15)
 
 
-def test_vectors_and_single_numbers_have_the_same_bits_and_wait_for_each_other():
-    """Calls that need the results of others, and values that outlive both."""
+def test_vector_and_scalar_calls_agree_and_respect_dependencies():
+    """Calls that depend on other results, and values that are used long after both."""
     g = Graph()
     x = [g.input("x", i) for i in range(5)]
     places = {a.number: ("x", i) for i, a in enumerate(x)}

@@ -1,4 +1,4 @@
-"""Fingerprints follow all that a function may read, by value."""
+"""Fingerprints cover everything that a function may read, by value."""
 
 import enum
 import functools
@@ -52,7 +52,7 @@ class Ring:
         self.me = self
 
 
-def test_the_same_is_equal_and_another_differs():
+def test_equal_values_have_equal_fingerprints_and_others_differ():
     values = [
         *(0.0, -0.0, 1.0, 1, True, math.nan, "1", b"1", None, [1.0], (1.0,), {1}, {"a": 1.0}),
         *(np.zeros(3), np.zeros((3, 1)), np.zeros(3, dtype=int), np.float64(1.0)),
@@ -67,10 +67,10 @@ def test_the_same_is_equal_and_another_differs():
     assert fingerprint((), math.nan) == fingerprint((), float("nan"))
 
 
-def test_parameters_are_inputs_where_they_are_the_modules_own():
+def test_parameters_of_a_module_itself_are_inputs():
     module, other = nn.Linear(2, 2), nn.Linear(2, 2)
     assert fingerprint((module,)) == fingerprint((other,))
-    # Held by a function, they are constants of the trace.
+    # If a function holds them, they are constants of the trace.
     assert fingerprint((), module) != fingerprint((), other)
     assert fingerprint((), lambda: module.weight) != fingerprint((), lambda: other.weight)
     assert fingerprint((module,)) != fingerprint((module.double(),))
@@ -79,7 +79,7 @@ def test_parameters_are_inputs_where_they_are_the_modules_own():
     assert fingerprint((other,)) != before
 
 
-def test_what_functions_read_is_followed():
+def test_values_read_by_functions_are_covered():
     def inner():
         return [KNOBS["list"] for _ in range(2)]
 
@@ -104,7 +104,7 @@ def test_what_functions_read_is_followed():
         torch.set_default_dtype(precise)
 
 
-def test_members_of_an_enumeration_are_followed_to_what_they_compute():
+def test_enumeration_members_are_covered_with_their_methods():
     for value in (Grade.THIN, Grade):
         for changed in (KNOBS["list"], Grade.LISTED.value):
             before = fingerprint((), value)
@@ -148,7 +148,7 @@ def _runs():
         ([].append, "builtin_function"),
     ],
 )
-def test_what_cannot_be_compared_is_named(value, named):
+def test_incomparable_values_are_named(value, named):
     with pytest.raises(Incomparable, match=named):
         fingerprint((), value)
     chain = []

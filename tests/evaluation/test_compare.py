@@ -25,10 +25,10 @@ A, B = (swing(pendulum(), MODEL, seconds=1.5, start=s, name=n)
 
 class Stages(Progress):
     def __init__(self):
-        self.told = []
+        self.labels = []
 
     def stage(self, what):
-        self.told.append(what)
+        self.labels.append(what)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def comparison():
     return found, stages
 
 
-def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
+def test_tables_have_one_row_per_model_and_one_column_per_joint(comparison):
     found, stages = comparison
     for horizon in (None, "0.5", "1"):
         for part in ("train", "test"):
@@ -51,10 +51,10 @@ def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
     saved = found.improvement()
     assert (saved.loc["no friction"] == 0).all()
     assert (saved.loc["LFM"] > 0).all()
-    assert stages.told[:2] == ["fit NCFM", "fit LFM"]
+    assert stages.labels[:2] == ["fit NCFM", "fit LFM"]
 
 
-def test_it_tells_in_a_few_lines_who_is_best(comparison):
+def test_repr_names_the_best_model_in_a_few_lines(comparison):
     found, _ = comparison
     head, *rows = repr(found).splitlines()
     assert head.endswith("test recordings, best: LFM")
@@ -63,12 +63,12 @@ def test_it_tells_in_a_few_lines_who_is_best(comparison):
     for row, (name, errors) in zip(rows[2:], table.iterrows(), strict=True):
         assert row.startswith(name)
         assert float(row.split()[-1]) == pytest.approx(1e3 * errors["all"], rel=1e-3)
-    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, test={}))
-    assert "training recordings, best: None" in told
-    assert told.endswith("not fitted: ALFM: no classes")
+    text = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, test={}))
+    assert "training recordings, best: None" in text
+    assert text.endswith("not fitted: ALFM: no classes")
 
 
-def test_fits_are_found_by_plain_names_and_a_notebook_shows_them(comparison):
+def test_fits_are_found_by_plain_names_and_shown_in_a_notebook(comparison):
     found, _ = comparison
     assert found.fits["load-coulomb"] is found.fits["LFM"]
     with pytest.raises(KeyError, match=r"stribeck; there are viscous \(NCFM\)"):
@@ -87,13 +87,13 @@ def test_one_name_and_one_recording_need_no_list():
     assert one.to_dict() == many.to_dict()
 
 
-def test_what_could_not_be_fitted_is_kept_with_its_reason(comparison):
+def test_failed_models_are_kept_with_the_reason(comparison):
     found, _ = comparison
     assert "failed" not in found.to_dict()
     assert dataclasses.replace(found, failed={"ALFM": "x"}).to_dict()["failed"] == {"ALFM": "x"}
 
 
-def test_its_frame_has_every_error_once(comparison):
+def test_data_frame_has_every_error_once(comparison):
     found, _ = comparison
     table = found.to_frame()
     keys = ["model", "recording", "part", "horizon", "joint"]
@@ -110,7 +110,7 @@ def test_its_frame_has_every_error_once(comparison):
     assert "rmse [m]" in metres.columns
 
 
-def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
+def test_results_are_plain_json_with_the_documented_keys(comparison):
     found, _ = comparison
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert data["units"] == "rad"
@@ -126,7 +126,7 @@ def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
     assert "coefficients" not in data["models"]["no friction"]
 
 
-def test_names_must_tell_recordings_apart():
+def test_recording_names_must_be_unique():
     with pytest.raises(ValueError, match="a repeats; rename one"):
         compare(pendulum(), ["NCFM"], [A], [dataclasses.replace(B, name="a")])
     unnamed = [dataclasses.replace(r, name="") for r in (A, B)]
@@ -138,19 +138,19 @@ def test_names_must_tell_recordings_apart():
         compare(pendulum(), ["NOPE"], [A])
 
 
-def test_a_recording_is_not_judged_by_under_another_name_either():
+def test_renamed_training_recording_is_refused_as_test():
     for name in ("a", "copy"):
         with pytest.raises(ValueError, match=rf"{name}: used for training and testing; .*not seen"):
             compare(pendulum(), ["NCFM"], [A], [B, dataclasses.replace(A, name=name)])
 
 
-def test_a_test_recording_without_torque_is_named_where_those_of_training_have_it():
+def test_test_recording_without_torque_is_named_if_training_has_torque():
     driven = dataclasses.replace(A, tau=np.full_like(A.q, 1e-3))
     with pytest.warns(UserWarning, match=r"no torque is recorded in b, unlike"):
         compare(pendulum(), "NCFM", driven, B, horizons=(0.5,), windows=(0.5,), max_steps=1)
 
 
-def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
+def test_test_recording_faster_than_all_training_data_is_named(recwarn):
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
     compare(pendulum(), "NCFM", A, B, **settings)
     assert not [w for w in recwarn if "extrapolated" in str(w.message)]
@@ -158,7 +158,7 @@ def test_a_test_recording_faster_than_all_of_training_is_named(recwarn):
         compare(pendulum(), "NCFM", B, A, **settings)
 
 
-def test_a_direction_without_training_is_named():
+def test_direction_without_training_data_is_named():
     time = np.arange(0.0, 2.0, 2e-3)
     forward = (10 * time - time**2)[:, None]
     parts = (Recording(time, q, name=name) for q, name in ((forward, "a"), (-0.9 * forward, "b")))
@@ -187,7 +187,7 @@ def test_a_mistake_in_a_test_recording_is_named(recwarn):
         ({"friction": 1.5}, r"the friction of joint1 is 1\.[45]\d* times theirs"),
         ({"gain": 1.3}, r"the force of joint1 is 1\.(29|3)\d* times theirs"),
         ({"bias": 0.1}, r"the force of joint1 has an offset of 0\.(09|1)\d* N"),
-        # A mistake with a name of its own.
+        # A mistake with a specific name.
         ({"gain": -1.0}, ""),
         ({}, ""),
     ],
@@ -199,12 +199,14 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
         truth = CVFM(1, [[0.8 * own.get("friction", 1), 2.0 * own.get("friction", 1)]])
         made = driven_axis(axis, truth.requires_grad_(False), seconds=4.0)
         tau = made.tau * own.get("gain", 1) + own.get("bias", 0)
-        # Neither may be a piece of the other.
+        # Neither may be a part of the other.
         cut = slice(0, -100) if name == "train" else slice(100, None)
         recordings.append(dataclasses.replace(made, tau=tau, name=name)[cut])
     compare(axis, "CVFM", *recordings, horizons=(0.5,), windows=(0.5,), fit_plant=False)
-    said = [str(w.message) for w in recwarn if "differs from the training" in str(w.message)]
-    assert [bool(re.search(text, sentence)) for sentence in said] == [True] * bool(text), said
+    messages = [str(w.message) for w in recwarn if "differs from the training" in str(w.message)]
+    assert [bool(re.search(text, sentence)) for sentence in messages] == [True] * bool(text), (
+        messages
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,14 +216,14 @@ def test_a_test_recording_that_differs_from_training_is_named(recwarn, change, t
             {"friction": 3.0},
             r"friction of joint1 is 3\.?\d* times and of joint2 is (3|2\.9)\d* times theirs",
         ),
-        # Hardly visible in the torque, but over seconds of motion.
+        # Hardly visible in the torque, but clear over seconds of motion.
         ({"friction": 1.1}, r"free: the best fit errs by .* times the limit of these data; in"),
         ({"of joint1": 4.0}, r"ings: the friction of joint1 is (4|3\.9)[.\d]* times theirs"),
         ({"zero": 0.1}, r"the encoder of joint2 has another zero, 5\.[78]\d* degrees off"),
         ({}, ""),
     ],
 )
-def test_a_free_test_recording_that_differs_is_named(recwarn, change, text):
+def test_undriven_test_recording_that_differs_is_named(recwarn, change, text):
     rig = PendulumChain([0.5, 0.3], [0.3, 0.25])
     recordings = []
     for name, start in (("train", (2.0, 0.2)), ("free", (2.2, 0.5))):
@@ -233,17 +235,19 @@ def test_a_free_test_recording_that_differs_is_named(recwarn, change, text):
         q = made.q + np.array([0.0, own.get("zero", 0.0)])
         recordings.append(dataclasses.replace(made, q=q, name=name))
     compare(rig, "CVFM", *recordings, horizons=(1.0,), windows=(0.5,), drag=False)
-    said = [str(w.message) for w in recwarn if str(w.message).startswith("free: ")]
-    assert [bool(re.search(text, sentence)) for sentence in said] == [True] * bool(text), said
+    messages = [str(w.message) for w in recwarn if str(w.message).startswith("free: ")]
+    assert [bool(re.search(text, sentence)) for sentence in messages] == [True] * bool(text), (
+        messages
+    )
 
 
-def test_a_piece_of_a_training_recording_is_no_test():
+def test_part_of_a_training_recording_is_refused_as_test():
     piece = dataclasses.replace(A[200:600], name="piece")
     with pytest.raises(ValueError, match="piece: used for training and testing"):
         compare(pendulum(), "NCFM", A, piece)
 
 
-def test_noise_at_rest_is_no_faster_motion(recwarn):
+def test_noise_at_rest_is_not_taken_for_faster_motion(recwarn):
     rng = np.random.default_rng(0)
     still = [
         dataclasses.replace(x, q=x.q[:1] + size * rng.normal(size=x.q.shape))
@@ -254,7 +258,7 @@ def test_noise_at_rest_is_no_faster_motion(recwarn):
     assert not [w for w in recwarn if "extrapolated" in str(w.message)]
 
 
-def test_without_test_recordings_there_is_no_such_table(comparison):
+def test_without_test_recordings_there_is_no_test_table(comparison):
     found = compare(pendulum(), ["NCFM"], [A], horizons=(0.5,), windows=(0.5,), max_steps=1)
     assert found.table(part="train").shape == (2, 3)
     with pytest.raises(ValueError, match="test"):
@@ -262,7 +266,7 @@ def test_without_test_recordings_there_is_no_such_table(comparison):
     assert set(found.to_dict()["models"]) == {"no friction", "NCFM"}
 
 
-def test_no_friction_is_judged_on_the_plant_as_given(comparison):
+def test_frictionless_baseline_uses_the_plant_as_given(comparison):
     found, _ = comparison
     other = compare(pendulum(), ["LFM"], [A], [B], horizons=(0.5,), windows=(0.5,), max_steps=2)
     for kind in ("train", "test"):
@@ -281,7 +285,7 @@ def test_every_recording_is_smoothed_once(monkeypatch):
     for user in ("evaluation.compare", "fitting.data.inputs"):
         monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
     compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
-    # No score needs the smoothed motion: that of the test shows how fast it is.
+    # No score needs the smoothed motion; the test recording's is used for its speed.
     assert len(smoothed) == 2
 
 
@@ -290,7 +294,7 @@ def test_recordings_too_short_for_a_window_are_named(comparison):
     assert found.too_short() == found.too_short("train") == {}
     asked = dataclasses.replace(found, horizons_asked=(1.0, 2.0))
     assert asked.too_short() == {"2": {"b": pytest.approx(1.5)}}
-    # A window length that one kind of recording lacks is still there for the other.
+    # A window length that one set of recordings is too short for is still used for the other.
     shorter = {n: [dataclasses.replace(s, windows={}) for s in of] for n, of in found.train.items()}
     mixed = dataclasses.replace(found, train=shorter)
     assert mixed.horizons() == mixed.horizons("train") == []
@@ -298,9 +302,10 @@ def test_recordings_too_short_for_a_window_are_named(comparison):
 
 
 def scored(found: Comparison, limit: float | None = None, **errors: float) -> Comparison:
-    """A comparison in which these were the errors of free runs, and their limit.
+    """A comparison with these free-run errors and this limit.
 
-    Errors are of each of two recordings; the limit is of the first, and twice that of the second.
+    Errors are those of each of two recordings; the limit is that of the first, and twice that of
+    the second.
     """
     test = {
         name.replace("_", " "): [
@@ -316,35 +321,35 @@ def scored(found: Comparison, limit: float | None = None, **errors: float) -> Co
     return dataclasses.replace(found, test=test)
 
 
-def judged(found: Comparison, **errors: float) -> str | None:
-    """The best of a comparison in which these were the errors of free runs."""
+def best_of(found: Comparison, **errors: float) -> str | None:
+    """The best model of a comparison with these free-run errors."""
     return scored(found, **errors).best()
 
 
-def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
+def test_best_model_has_the_least_error_and_of_equals_is_the_simplest(comparison):
     found, _ = comparison
     assert found.to_dict()["best"]["model"] == found.best() == "LFM"
-    assert judged(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
-    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
-    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
-    assert judged(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
-    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
-    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
+    assert best_of(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
+    assert best_of(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
+    assert best_of(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
+    assert best_of(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
+    assert best_of(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
+    assert best_of(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
     alone = dataclasses.replace(found, test={})
     assert alone.best() is None
     assert alone.to_dict()["best"] is None
 
 
-def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
+def test_models_within_the_limit_of_the_best_are_indistinguishable(comparison):
     found, _ = comparison
     errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
     assert scored(found, **errors).indistinguishable() == ("LFM",)
     assert "tied" not in verdict(scored(found, **errors))
-    # Without a limit equal errors say nothing of it, as those of a network that kept its law.
+    # Without a limit equal errors prove nothing, such as those of a network that kept its law.
     equal = scored(found, no_friction=5.0, NCFM=1.0, LFM=1.0)
     assert equal.indistinguishable() == (equal.best(),)
     near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
-    # Over both recordings root 2.5 of it: 1.1 and 0.95.
+    # Over both recordings the limit is root 2.5 times as large: 1.1 and 0.95.
     assert near.limit() == pytest.approx(0.7 * 2.5**0.5)
     assert near.limit(column="joint1") == 0
     assert near.indistinguishable() == ("NCFM", "LFM")
@@ -355,7 +360,7 @@ def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
     assert verdict(near).endswith("; the simplest of them is NCFM")
     printed = error_tables(near)
     assert re.search(r"limit of these data +0 +0 +1107\n", printed)
-    # Joints are known exactly here, and over all of them the two are tied.
+    # Joints are exact here, and over all of them the two are tied.
     assert re.search(r"NCFM +2000 +2000 +2000= +60\n", printed)
     assert re.search(r"LFM +1000 +1000 +1000= +80\n", printed)
     assert "=" not in error_tables(far).partition("free run: one")[0]
@@ -369,8 +374,8 @@ def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
 def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     found, _ = comparison
     good = {n: dataclasses.replace(f, residual=0.0, converged=True) for n, f in found.fits.items()}
-    vague = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))
-    doubtful = dataclasses.replace(found, fits=Fits({**good, "LFM": vague}))
+    unidentifiable = dataclasses.replace(good["LFM"], unidentifiable=("C of joint1",))
+    doubtful = dataclasses.replace(found, fits=Fits({**good, "LFM": unidentifiable}))
     assert [fit.usability[0] for fit in doubtful.fits.values()] == ["good", "doubtful"]
     near = scored(doubtful, 0.7, no_friction=5.0, NCFM=2.0, LFM=1.0)
     assert near.best() == "NCFM"
@@ -380,7 +385,7 @@ def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     assert scored(doubtful, 0.6, no_friction=5.0, NCFM=2.0, LFM=1.0).best() == "LFM"
 
 
-def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, tmp_path):
+def test_model_far_worse_than_one_of_equal_size_is_not_fit_for_use(comparison, tmp_path):
     found, _ = comparison
     assert scored(found, no_friction=5.0, NCFM=1.0, LFM=1.9).unfit() == {}
     runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
@@ -390,7 +395,7 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     assert line.startswith("LFM: do not use (in the test, NCFM, with no more parameters, errs by")
     assert runaway.to_dict()["unfit"] == runaway.unfit()
     write_results(runaway, [A], [B], tmp_path, figures=False)
-    # For whoever exports it later.
+    # The verdict is stored for a later export.
     stated = load_info(tmp_path / "models" / "LFM.json").rating
     assert stated.startswith("do not use: in the test, NCFM, with no more parameters, errs by")
     assert (
@@ -398,29 +403,29 @@ def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison, 
     )
     worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()
     assert worse == dict.fromkeys(("NCFM", "LFM"), "no friction predicts better")
-    # As many parameters are no excuse.
+    # An equal number of parameters does not matter.
     equal = dataclasses.replace(found, fits={**found.fits, "CVFM": found.fits["LFM"]})
     assert set(scored(equal, no_friction=5.0, CVFM=1.0, LFM=2.1).unfit()) == {"LFM"}
-    # A smaller model gets no better verdict for the same error.
+    # A smaller model gets the same verdict for the same error.
     errors = {"no_friction": 5.0, "NCFM": 2.1, "CVFM": 1.0, "LFM": 2.1}
     reasons = scored(equal, **errors).unfit()
     assert reasons["NCFM"] == "it predicts no better than LFM, not to be used"
     assert set(scored(equal, **errors | {"NCFM": 2.0}).unfit()) == {"LFM"}
     # The data do not separate these.
     assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}
-    # Near sticking, noise can make the law of the rig err like this: the best one was lucky.
+    # Near sticking, noise alone can cause such an error of the true law: the best one was lucky.
     errors = {"no_friction": 9.0, "NCFM": 1.0, "LFM": 3.0}
     sensitive = scored(found, 0.1, **errors)
     sensitive.test["LFM"] = scored(found, 3.0, **errors).test["LFM"]
     assert set(scored(found, 0.1, **errors).unfit()) == {"LFM"}
     assert sensitive.unfit() == {}
-    # In chaotic motion any law is as sensitive.
+    # In chaotic motion every law is as sensitive.
     sensitive.test["LFM"] = scored(found, 9.5, **errors).test["LFM"]
     assert set(sensitive.unfit()) == {"LFM"}
     assert dataclasses.replace(found, test={}).unfit() == {}
 
 
-def test_coefficients_that_follow_the_motion_say_what_they_hold_for():
+def test_motion_dependent_coefficients_name_their_reference_motion():
     assert coefficient_summary(LFM(2, [3.0, 4.0])) == {
         "B": pytest.approx([3.0, 3.0]),
         "C": pytest.approx([4.0, 4.0]),

@@ -1,4 +1,4 @@
-"""The choice of a law: by error on hold-out blocks, and the simpler one where that is a draw."""
+"""Choice of a law by error on hold-out blocks; the simpler law if there is no clear difference."""
 
 import math
 import warnings
@@ -29,40 +29,40 @@ def test_the_least_error_is_chosen():
     assert "A follows" in reason
 
 
-def test_a_draw_goes_to_the_simpler_model():
+def test_tie_is_decided_for_the_simpler_model():
     simple, rich = candidate("A", (1.01, 1.0, 1.0), 1), candidate("B", (1, 1, 1), 9)
     name, reason = choose([rich, simple])
     assert name == "A"
     assert "fewer parameters" in reason
 
 
-def test_what_one_block_alone_decides_is_a_draw():
-    """The mean differs, but by no more than its standard error over blocks."""
+def test_difference_in_a_single_block_is_a_tie():
+    """The mean differs by at most its standard error over blocks."""
     simple, rich = candidate("A", (1.0, 1.0, 3.0), 1), candidate("B", (1.0, 1.0, 1.0), 9)
     assert choose([simple, rich])[0] == "A"
     steady = candidate("A", (1.4, 1.5, 1.6), 1)
     assert choose([steady, rich])[0] == "B"
 
 
-def test_one_violent_block_does_not_hide_what_is_worse_on_all_others():
-    """The single pendulum's blocks: of nine, two of far larger swings than were trained on."""
+def test_one_outlying_block_does_not_hide_a_consistently_worse_model():
+    """The single pendulum's nine blocks: two have far larger swings than the training data."""
     simple = candidate("A", (2.24, 2.98, 6.36, 5.02, 2.33, 1.87, 4.16, 4.63, 3.34), 1)
     rich = candidate("B", (7.25, 1.77, 2.85, 6.35, 1.3, 1.22, 0.91, 2.04, 1.29), 5)
     name, reason = choose([simple, rich])
     assert name == "B"
     assert "A follows" in reason
-    # As many better as worse, and nothing is told.
+    # As many blocks are better as worse, which proves nothing.
     mixed = candidate("A", (7.9, 1.9, 2.6, 6.3, 1.2, 1.3, 1.0, 1.9, 1.4), 1)
     assert choose([mixed, rich])[0] == "A"
 
 
-def test_what_diverges_is_not_chosen():
+def test_diverging_model_is_not_chosen():
     lost, fine = candidate("A", (math.inf, 1.0), 1), candidate("B", (5.0, 5.0), 9)
     assert choose([lost, fine])[0] == "B"
     assert choose([lost])[0] == "A"
 
 
-def test_it_tells_the_choice_and_every_candidate():
+def test_repr_shows_the_choice_and_every_candidate():
     candidates = (candidate("A", (3e-3, 4e-3), 1), candidate("B", (math.inf,), 9))
     found = Selection("A", "so it is.", candidates, 2.0, "rad")
     head, _, *rows = repr(found).splitlines()
@@ -92,7 +92,7 @@ def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
     assert not failed.converged
 
 
-def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
+def test_blocks_cover_a_recording_and_share_their_end_samples():
     recording = swing(pendulum(), LFM(2, [1e-3, 1e-3], v_smooth=0.05), seconds=1.0)
     folds = blocked_k_fold(pendulum(), recording, 3)
     blocks = [fold.test for fold in folds]
@@ -109,8 +109,8 @@ def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
             np.testing.assert_array_equal(part.motion.time, part.recording.time)
 
 
-def test_a_fold_sees_nothing_of_what_it_is_judged_by(monkeypatch):
-    """And of two recordings it misses different stretches."""
+def test_fold_does_not_use_its_hold_out_data(monkeypatch):
+    """With two recordings, each fold misses a different segment of each."""
     folds = []
 
     def watched(plant, names, parts, **_):
@@ -135,7 +135,7 @@ def test_a_fold_sees_nothing_of_what_it_is_judged_by(monkeypatch):
     assert all(a != b for a, b in zip(missing[::2], missing[1::2], strict=True))
 
 
-def test_recordings_with_gaps_are_judged_by_what_fits_between_them(monkeypatch):
+def test_recordings_with_gaps_are_scored_between_the_gaps(monkeypatch):
     whole = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=2.0)
     recording = whole[(whole.time < 0.4) | (whole.time > 0.8)]
     monkeypatch.setattr("nfriction.evaluation.parallel.fit", by_torque)
@@ -144,7 +144,7 @@ def test_recordings_with_gaps_are_judged_by_what_fits_between_them(monkeypatch):
     assert all(map(math.isfinite, found.candidates[0].errors))
 
 
-def test_what_is_left_of_a_recording_is_no_reason_to_warn():
+def test_remaining_parts_of_a_recording_cause_no_warnings():
     recording = swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RecordingWarning)
@@ -168,8 +168,8 @@ def test_bad_input_is_refused():
 
 
 @pytest.mark.slow
-def test_the_law_that_made_the_recording_is_chosen():
-    """Dry friction is not viscous, and viscous friction is not worth a Coulomb coefficient."""
+def test_true_law_is_chosen():
+    """Dry friction is not viscous, and for viscous friction a Coulomb coefficient does not pay."""
     settings = {"folds": 2, "fit_plant": False, "windows": (0.5,)}
     dry = swing(pendulum(), LFM(2, [[1e-5, 3e-3], [1e-5, 2e-3]], v_smooth=0.05), seconds=4.0)
     found = select(pendulum(), ["NCFM", "LFM"], [dry], **settings)

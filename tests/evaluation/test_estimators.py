@@ -1,4 +1,4 @@
-"""The estimator: learns what made the recordings, and keeps to scikit-learn's rules."""
+"""The estimator recovers true parameters and follows scikit-learn's rules."""
 
 import dataclasses
 import inspect
@@ -18,7 +18,7 @@ pytest.importorskip("sklearn")
 
 TRUE = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 STARTS = ((1.6, 0.8), (2.0, 0.2), (1.2, -0.5))
-# Torques are one least squares: what is tested here is the estimator, not the search.
+# Torques need one linear least squares: these tests cover the estimator, not the search.
 QUICK = {"method": "equation_error"}
 
 
@@ -35,7 +35,7 @@ def fitted(recordings: list[Recording]) -> FrictionEstimator:
     return FrictionEstimator(pendulum(), start, **QUICK).fit(recordings[:2])
 
 
-def test_learns_the_coefficients_that_made_the_recordings(fitted: FrictionEstimator) -> None:
+def test_true_coefficients_are_recovered(fitted: FrictionEstimator) -> None:
     true = LFM(2, TRUE, v_smooth=0.05).requires_grad_(False)
     qd = np.linspace(-3, 3, 20).reshape(10, 2)
     tau = true(*map(torch.tensor, (qd, np.zeros_like(qd), np.ones_like(qd)))).numpy()
@@ -46,10 +46,10 @@ def test_learns_the_coefficients_that_made_the_recordings(fitted: FrictionEstima
     assert fitted.coef_.shape == (fitted.n_joints_, len(fitted.coef_names_))
     assert fitted.fit_.converged
     assert isinstance(fitted.model, LFM)
-    assert fitted.model_ is not fitted.model  # what was given stays as it is
+    assert fitted.model_ is not fitted.model  # given arguments are unchanged
 
 
-def test_is_the_fit_of_the_same_settings(
+def test_result_equals_a_fit_with_the_same_settings(
     fitted: FrictionEstimator, recordings: list[Recording]
 ) -> None:
     own = fit(LFM(2, v_smooth=0.05), pendulum(), recordings[:2], **QUICK)
@@ -76,8 +76,8 @@ def test_predicts_the_torque_of_its_model(
         fitted.predict(qd, load=np.ones((4, 2)))
 
 
-def test_a_memory_follows_the_samples(fitted: FrictionEstimator) -> None:
-    """One after the other, an adaptive model's classes are those that a controller would know."""
+def test_hidden_state_follows_the_samples(fitted: FrictionEstimator) -> None:
+    """Over successive samples, an adaptive model's classes are those a controller would see."""
     rng = np.random.default_rng(0)
     model = ALFM(2, rng.uniform(1e-4, 1e-2, (2, 3, 2)).tolist())
     estimator = FrictionEstimator(pendulum(), "ALFM")
@@ -93,8 +93,8 @@ def test_a_memory_follows_the_samples(fitted: FrictionEstimator) -> None:
         _ = estimator.coef_
 
 
-def test_a_law_with_memory_follows_a_recording(fitted: FrictionEstimator) -> None:
-    """Torques in it, below breakaway and sliding, are those of the rollout that made it."""
+def test_law_with_memory_is_evaluated_along_a_recording(fitted: FrictionEstimator) -> None:
+    """Its torques, below breakaway and sliding, equal those of the rollout that was recorded."""
     model = LuGre(1, [1.0, 0.5, 0.05, 300.0, 5.0, 0.4]).requires_grad_(False)
     time = np.arange(3001) * 1e-3
     tau = (np.array([0.7, 2.0])[(time > 1.5).astype(int)] * np.sin(6 * time))[:, None]
@@ -110,7 +110,7 @@ def test_a_law_with_memory_follows_a_recording(fitted: FrictionEstimator) -> Non
         estimator.predict(run.qd.numpy())
 
 
-def test_simulates_into_a_table_like_that_of_the_recording(
+def test_simulation_is_a_table_like_that_of_the_recording(
     fitted: FrictionEstimator, recordings: list[Recording]
 ) -> None:
     measured = recordings[2].to_pandas()
@@ -124,31 +124,31 @@ def test_simulates_into_a_table_like_that_of_the_recording(
     assert np.sqrt(np.mean(scored**2)) == pytest.approx(free_run, rel=1e-12)
 
 
-def test_tables_serve_as_recordings(fitted: FrictionEstimator, recordings: list[Recording]) -> None:
+def test_tables_are_accepted_as_recordings(
+    fitted: FrictionEstimator, recordings: list[Recording]
+) -> None:
     tables = [r.to_pandas() for r in recordings]
     assert fitted.score(tables) == fitted.score(recordings)
     pd.testing.assert_frame_equal(fitted.simulate(tables[0]), fitted.simulate(recordings[0]))
 
 
-def test_a_table_that_says_no_unit_is_in_the_plant_s() -> None:
-    axis, said = LinearAxis(2.0), "table 1 is in rad, the plant's joints are in m"
+def test_table_without_a_unit_has_that_of_the_plant() -> None:
+    axis, message = LinearAxis(2.0), "table 1 is in rad, the plant's joints are in m"
     table = driven_axis(axis, LFM(1, [[3.0, 2.0]])).to_pandas()
     plain = pd.DataFrame(table.to_numpy(), columns=table.columns)
     found = FrictionEstimator(axis, "LFM", **QUICK).fit(plain)
     assert found.simulate(plain).shape == (len(plain), 2)
     table.attrs["unit"] = "rad"
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         FrictionEstimator(axis, "LFM", **QUICK).fit(table)
 
 
-def test_the_right_law_scores_higher(
-    fitted: FrictionEstimator, recordings: list[Recording]
-) -> None:
+def test_true_law_scores_higher(fitted: FrictionEstimator, recordings: list[Recording]) -> None:
     other = FrictionEstimator(pendulum(), NCFM(2), **QUICK).fit(recordings[:2])
     assert other.score(recordings[2:]) < fitted.score(recordings[2:]) < 0
 
 
-def test_parameters_are_kept_as_given_and_told() -> None:
+def test_parameters_are_kept_as_given_and_shown() -> None:
     plant, windows = pendulum(name="rig"), [0.5]
     estimator = FrictionEstimator(plant, "NLFM", windows=windows)
     names = list(inspect.signature(FrictionEstimator).parameters)
@@ -156,8 +156,8 @@ def test_parameters_are_kept_as_given_and_told() -> None:
     assert estimator.get_params()["plant"] is plant
     assert estimator.get_params()["windows"] is windows
     assert estimator.set_params(model="CFM", drag=True) is estimator
-    for said in ("drag=True", "model='CFM'", "windows=[0.5]", "rig"):
-        assert said in repr(estimator)
+    for argument in ("drag=True", "model='CFM'", "windows=[0.5]", "rig"):
+        assert argument in repr(estimator)
     assert "max_steps" not in repr(estimator)
     with pytest.raises(ValueError, match="Invalid parameter 'law'"):
         estimator.set_params(law="LFM")
@@ -165,7 +165,7 @@ def test_parameters_are_kept_as_given_and_told() -> None:
         FrictionEstimator(plant, law="LFM")
 
 
-def test_misuse_is_told(recordings: list[Recording]) -> None:
+def test_misuse_raises_clear_errors(recordings: list[Recording]) -> None:
     with pytest.raises(ValueError, match="not fitted yet"):
         FrictionEstimator(pendulum()).predict(np.zeros((1, 2)))
     with pytest.raises(ValueError, match="`plant` is missing"):
@@ -183,7 +183,7 @@ def test_misuse_is_told(recordings: list[Recording]) -> None:
         FrictionEstimator("penduluum").fit(recordings)
 
 
-def test_clones_search_grids_and_are_cross_validated(recordings: list[Recording]) -> None:
+def test_estimator_works_in_grid_search_and_cross_validation(recordings: list[Recording]) -> None:
     sklearn = pytest.importorskip("sklearn")
     from sklearn.model_selection import GridSearchCV, LeaveOneOut, cross_val_score
     from sklearn.utils.validation import check_is_fitted
@@ -202,7 +202,7 @@ def test_clones_search_grids_and_are_cross_validated(recordings: list[Recording]
     assert search.score(recordings) < 0
     scores = cross_val_score(copy.set_params(model="LFM"), recordings, cv=LeaveOneOut())
     assert scores.shape == (len(recordings),)
-    # The mean of the search is of the same three scores.
+    # The mean of the search is over the same three scores.
     found = search.cv_results_["mean_test_score"][
         list(search.cv_results_["param_model"]).index("LFM")
     ]

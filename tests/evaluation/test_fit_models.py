@@ -1,4 +1,4 @@
-"""Many fits: an order that lets most run at once, results that do not depend on the processes."""
+"""Several fits: an order that allows most parallel work, results independent of the processes."""
 
 import logging
 from itertools import permutations
@@ -28,7 +28,7 @@ def data() -> Data:
 @pytest.mark.parametrize(
     "names", [list(model_names()), list(model_names())[::-1], ["NFLFM", "ALFM"], ["LFM"]]
 )
-def test_every_start_is_there_before_it_is_needed(names: list[str]) -> None:
+def test_every_start_is_fitted_before_it_is_needed(names: list[str]) -> None:
     origin = warm_starts(names)
     fitted: set[str | None] = {None}
     for group in dependency_levels(origin):
@@ -45,17 +45,17 @@ def test_networks_and_classes_start_from_the_constant_fit_of_their_law() -> None
         assert origin[first] is None
         assert origin[second] == first
     assert warm_starts(["NFLFM", "NCFM"]) == {"NFLFM": "NCFM", "NCFM": None}
-    # All models at once take three rounds, not one to each.
+    # All models together take three rounds, not one each.
     assert len(list(dependency_levels(warm_starts(list(model_names()))))) == 3
 
 
 def same(one: FitResult, other: FitResult) -> bool:
-    """True where two fits are the same to the last bit."""
+    """True if two fits are equal bit for bit."""
     pairs = zip(one.model.state_dict().values(), other.model.state_dict().values(), strict=True)
     return one.to_dict() == other.to_dict() and all(torch.equal(a, b) for a, b in pairs)
 
 
-# A network's law must be known again in another process: laws are told by identity.
+# A network's law must be recognised in another process: laws are compared by identity.
 CASES = [
     pytest.param(["NCFM", "LFM"], {"method": "equation_error"}, marks=pytest.mark.slow),
     pytest.param(["LFM", "NFLFM"], QUICK, marks=pytest.mark.slow),
@@ -81,7 +81,7 @@ def test_results_do_not_depend_on_the_number_of_processes(
     assert all(same(alone[name], fits["x"][name]) for name in names)
 
 
-def test_a_model_that_fails_loses_no_other(
+def test_failed_model_does_not_lose_the_others(
     data: Data, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     started: dict[str, FitResult | None] = {}
@@ -106,7 +106,7 @@ def test_a_model_that_fails_loses_no_other(
         fit_models(pendulum(), ["LFM"], {"fit": data})
 
 
-def test_what_cannot_cross_to_other_processes_is_refused(data: Data) -> None:
+def test_objects_that_cannot_be_sent_to_processes_are_refused(data: Data) -> None:
     pytest.importorskip("joblib")
     with pytest.raises(ValueError, match="progress"):
         fit_models(pendulum(), ["LFM"], {"fit": data}, jobs=2, callback=lambda *_: None)

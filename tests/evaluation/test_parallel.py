@@ -1,4 +1,4 @@
-"""Work in parallel processes: the same results, told here, errors with a name, a clean end."""
+"""Parallel work: equal results, messages in the parent, named errors, clean interruption."""
 
 import json
 import logging
@@ -41,7 +41,7 @@ def jobs(request: pytest.FixtureRequest) -> int:
     return request.param
 
 
-def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
+def test_every_task_runs_on_one_thread(jobs: int) -> None:
     pieces = {f"piece {k}": (float(k),) for k in range(4)}
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -58,21 +58,23 @@ def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
     assert (processes == {os.getpid()}) == (jobs == 1)
 
 
-def test_the_caller_is_told_what_is_done(jobs: int) -> None:
-    told: list[str] = []
+def test_caller_receives_progress(jobs: int) -> None:
+    stages: list[str] = []
     progress = parallel.Progress()
-    progress.stage = told.append  # type: ignore[method-assign]
+    progress.stage = stages.append  # type: ignore[method-assign]
     pieces = {"a": (1.0,), "b": (2.0,)}
     list(parallel.as_completed(whereabouts, pieces, jobs=jobs, progress=progress))
     if jobs == 1:
-        assert told == ["a", "b"]
+        assert stages == ["a", "b"]
     else:
-        assert told[0] == "a | b"
-        assert {line.split()[0] for line in told[1:]} == {"a", "b"}
-        assert told[-1].endswith("done, 0 of 2 left")
+        assert stages[0] == "a | b"
+        assert {line.split()[0] for line in stages[1:]} == {"a", "b"}
+        assert stages[-1].endswith("done, 0 of 2 left")
 
 
-def test_logs_and_warnings_reach_this_process(jobs: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_logs_and_warnings_reach_the_parent_process(
+    jobs: int, caplog: pytest.LogCaptureFixture
+) -> None:
     pieces = {"a": ("the first",), "b": ("the second",)}
     with caplog.at_level(logging.INFO, "nfriction"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -81,22 +83,22 @@ def test_logs_and_warnings_reach_this_process(jobs: int, caplog: pytest.LogCaptu
     assert sorted(str(w.message) for w in caught) == ["the first is odd", "the second is odd"]
 
 
-def test_an_error_names_its_piece_and_keeps_its_kind(jobs: int) -> None:
+def test_error_names_its_task_and_keeps_its_type(jobs: int) -> None:
     with pytest.raises(ZeroDivisionError, match=r"^fit LFM: by naught$"):
         list(parallel.as_completed(fail, {"fit LFM": ("by naught",)}, jobs=jobs))
     with pytest.raises(ZeroDivisionError, match=r"^[ab]: naught$"):
         list(parallel.as_completed(fail, {"a": ("naught",), "b": ("naught",)}, jobs=jobs))
 
 
-def test_the_callers_backend_does_the_work() -> None:
-    """Such as a Dask cluster's; threads of this process show the same."""
+def test_callers_joblib_backend_is_used() -> None:
+    """Such as a Dask cluster's; threads of this process are equivalent."""
     joblib = pytest.importorskip("joblib")
     with joblib.parallel_config(backend="threading"):
         found = dict(parallel.as_completed(whereabouts, {"a": (1.0,), "b": (2.0,)}, jobs=2))
     assert {process for _, process, _ in found.values()} == {os.getpid()}
 
 
-def test_what_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="at least 1, or -1"):
         parallel.check_jobs(0)
     monkeypatch.setitem(sys.modules, "joblib", None)
@@ -131,7 +133,7 @@ def test_finished_fits_survive_ctrl_c() -> None:
     assert [*found.test] == ["no friction", "NCFM"]
     with pytest.raises(KeyboardInterrupt):
         compare(pendulum(), ["NCFM"], [swing("a", 1.5)], progress=Interrupted(1), **settings)
-    # While results are scored, nothing is left to be saved.
+    # While results are scored, there is nothing left to save.
     with pytest.raises(KeyboardInterrupt):
         compare(pendulum(), ["NCFM"], [swing("a", 1.5)], progress=Interrupted(2), **settings)
 
@@ -139,7 +141,7 @@ def test_finished_fits_survive_ctrl_c() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to a group of processes")
 def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
-    """As a terminal does, the signal goes to the workers too, whose solvers would survive it."""
+    """As from a terminal, the signal also reaches the workers, whose solvers would catch it."""
     pytest.importorskip("joblib")
     from nfriction import rigs
 
@@ -158,14 +160,14 @@ def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
         time.sleep(0.1)
     time.sleep(1.0)  # the workers start
     os.killpg(process.pid, signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
+    messages = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert said.startswith("nfriction: warning: interrupted: the finished fits are scored")
-    # The model that was finished is not lost.
+    assert messages.startswith("nfriction: warning: interrupted: the finished fits are scored")
+    # The finished model is not lost.
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [*results["models"]] == ["no friction", "NCFM"]
     assert results["failed"] == {"NLFM": "interrupted", "Stribeck": "interrupted"}
-    # Nobody of the session is left to be told anything.
+    # No process of the session is left.
     for _ in range(50):
         try:
             os.killpg(process.pid, 0)

@@ -1,4 +1,4 @@
-"""A comparison writes its folder, also where models diverge or cannot be exported."""
+"""A comparison writes its folder, even if models diverge or cannot be exported."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def comparison(recording: Recording) -> Comparison:
     return Comparison(fits, scores, {}, unit="rad", joint_names=("joint1",))
 
 
-def test_divergence_is_null_and_stops_no_other_model(
+def test_divergence_is_null_and_does_not_stop_other_models(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     written = results.write_results(comparison, [recording], [], tmp_path, figures=False)
@@ -62,12 +62,12 @@ def test_divergence_is_null_and_stops_no_other_model(
     assert "diverged" not in rows["good"]
 
 
-def test_no_digest_is_lost_where_names_repeat_or_lack(recording: Recording) -> None:
+def test_digests_are_kept_if_names_are_repeated_or_missing(recording: Recording) -> None:
     others = [dataclasses.replace(recording, q=recording.q + k, name=name)
               for k, name in enumerate(("r", "", "", "s"), 1)]  # fmt: skip
-    told = results.digests([recording, *others])
-    assert list(told) == ["r (1)", "r (2)", "recording (3)", "recording (4)", "s"]
-    assert list(told.values()) == [r.digest() for r in (recording, *others)]
+    digests = results.digests([recording, *others])
+    assert list(digests) == ["r (1)", "r (2)", "recording (3)", "recording (4)", "s"]
+    assert list(digests.values()) == [r.digest() for r in (recording, *others)]
     assert set(results.digests([recording])) == {"r"}
 
 
@@ -79,15 +79,17 @@ def test_input_ranges_are_those_of_the_motion(comparison: Comparison, recording:
     assert info.training_data == {"r": recording.digest()}
 
 
-@pytest.mark.parametrize(("factors", "told"), [((1.0, 1.01, 0.99), 2e-3), ((1.0, 2.0), None)])
-def test_one_sample_time_is_told_where_recordings_share_it(
-    comparison: Comparison, recording: Recording, factors: tuple[float, ...], told: float | None
+@pytest.mark.parametrize(("factors", "expected"), [((1.0, 1.01, 0.99), 2e-3), ((1.0, 2.0), None)])
+def test_sample_time_is_stored_only_if_recordings_share_it(
+    comparison: Comparison, recording: Recording, factors: tuple[float, ...], expected: float | None
 ) -> None:
     several = [dataclasses.replace(recording, time=f * recording.time) for f in factors]
-    assert results.model_info(comparison.fits["good"], several).sample_time == pytest.approx(told)
+    assert results.model_info(comparison.fits["good"], several).sample_time == pytest.approx(
+        expected
+    )
 
 
-def test_a_failed_export_is_told_and_leaves_no_older_script(
+def test_failed_export_is_logged_and_removes_the_older_script(
     comparison: Comparison,
     recording: Recording,
     tmp_path: Path,
@@ -106,7 +108,7 @@ def test_a_failed_export_is_told_and_leaves_no_older_script(
     assert not list(tmp_path.rglob("*.pt"))
 
 
-def test_a_later_run_leaves_its_own_files_and_the_users(
+def test_later_run_keeps_only_its_own_and_the_users_files(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     def files() -> set[str]:
@@ -132,7 +134,7 @@ def test_a_later_run_leaves_its_own_files_and_the_users(
     assert files() == left | foreign
 
 
-def test_no_list_of_files_leads_out_of_the_folder(
+def test_listed_files_outside_the_folder_are_not_deleted(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
@@ -151,7 +153,7 @@ def test_no_list_of_files_leads_out_of_the_folder(
     assert all(victim.read_text() == "keep" for victim in victims)
 
 
-def test_a_choice_is_kept_with_the_results(
+def test_choice_is_stored_with_the_results(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     chosen = Selection("LFM", "so", (Candidate("LFM", (1e-3, np.inf), 2, True),), 1.0, "rad")
@@ -164,7 +166,7 @@ def test_a_choice_is_kept_with_the_results(
 
 
 def run_ids(folder: Path) -> dict[str, str]:
-    """Id of the run in each file of ours; TorchScript is a stub here."""
+    """Run id in each of our files; TorchScript is replaced by a stub."""
     ids = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder).as_posix()
@@ -189,7 +191,7 @@ def quick_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def other(comparison: Comparison) -> Comparison:
-    """A later run: another score, one model less."""
+    """A later run with another score and one model fewer."""
     train = {"no friction": [scored(0.3)], "good": [scored(0.2)]}
     return dataclasses.replace(comparison, fits={"good": comparison.fits["good"]}, train=train)
 
@@ -204,7 +206,7 @@ def test_a_kill_at_any_moment_never_mixes_two_runs(
         return str(json.loads((folder / "results.json").read_text())["run"])
 
     def write_and_die(folder: Path, moment: int) -> int:
-        """Write in a child that is killed at its file operation of this number; its status."""
+        """Exit status of a child that writes and is killed at its file operation of this number."""
         child = os.fork()
         if child:
             return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -258,7 +260,7 @@ def test_a_kill_at_any_moment_never_mixes_two_runs(
 
 
 @pytest.mark.usefixtures("quick_scripts")
-def test_ctrl_c_between_two_files_leaves_a_whole_run(
+def test_ctrl_c_between_two_files_leaves_a_complete_run(
     comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -283,7 +285,7 @@ def test_ctrl_c_between_two_files_leaves_a_whole_run(
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a second process")
 @pytest.mark.usefixtures("quick_scripts")
-def test_two_processes_do_not_write_one_folder_at_once(
+def test_concurrent_writes_to_one_folder_are_refused(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     reader, writer = os.pipe()
@@ -300,7 +302,7 @@ def test_two_processes_do_not_write_one_folder_at_once(
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-    # A killed process keeps nobody out.
+    # The lock of a killed process is void.
     with results.exclusive(tmp_path):
         results.write_results(comparison, [recording], [], tmp_path, figures=False)
     assert not list(tmp_path.glob(".*"))
@@ -327,7 +329,7 @@ def test_a_report_of_two_runs_is_refused(
 
 
 @pytest.mark.usefixtures("quick_scripts")
-def test_names_are_no_formulas_and_need_be_no_unicode(
+def test_names_are_not_spreadsheet_formulas_and_may_be_any_bytes(
     comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     names = ["=cmd|' /C calc'!A0", "+1", "-1", "@SUM(1)", "\t=1", "＝1", "surr\udcff", "a=b"]
@@ -346,7 +348,7 @@ def test_names_are_no_formulas_and_need_be_no_unicode(
     assert "surr\\udcff" in page.read_text(encoding="utf-8")
 
 
-def test_figures_that_fail_leave_nothing_half_drawn(
+def test_failed_figures_leave_no_partial_files(
     comparison: Comparison, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def half(_: object, __: object, folder: Path, **___: object) -> list[Path]:
@@ -361,7 +363,7 @@ def test_figures_that_fail_leave_nothing_half_drawn(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_info_of_a_model_takes_recordings_by_path(tmp_path) -> None:
+def test_model_info_accepts_recordings_by_path(tmp_path) -> None:
     time = 2e-3 * np.arange(500)
     recording = Recording(time, 0.3 * np.cos(4.0 * time)[:, None], convention="relative,hanging")
     recording.write(tmp_path / "run.csv")

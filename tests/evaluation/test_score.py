@@ -1,4 +1,4 @@
-"""Scores: near the encoder's noise for the true model, honest for a diverging one."""
+"""Scores: close to the encoder's noise for the true model, infinite for a diverging one."""
 
 import json
 import re
@@ -38,8 +38,8 @@ def plant(quantum=QUANTUM) -> PendulumChain:
 
 
 @pytest.mark.parametrize("convention", ["relative,upright", "absolute,hanging"])
-def test_the_true_model_is_as_good_as_the_encoder(convention):
-    """Started at the given state, in the recording's convention, only rounding is left."""
+def test_error_of_the_true_model_is_the_encoder_quantisation(convention):
+    """From the given state, in the recording's convention, only quantisation error remains."""
     recording = swing(plant(), MODEL, convention=convention, **SETTINGS)
     q0 = recording.convention.position_from_joint(np.array(SETTINGS["start"]))
     found = score(plant(), MODEL, recording, initial_state=(q0, np.zeros(2)))
@@ -52,19 +52,19 @@ def test_the_true_model_is_as_good_as_the_encoder(convention):
 
 
 @pytest.mark.filterwarnings("ignore:.*has gaps")
-def test_a_score_is_printed_in_a_line():
+def test_score_is_printed_in_one_line():
     errors = Errors(RMSE((0.0, 0.02), 0.0141421), {"1": RMSE((0.0, 0.01), 0.0070711)})
-    told = "free run: 0.0141, 1 s: 0.00707"
-    assert str(errors) == told
+    values = "free run: 0.0141, 1 s: 0.00707"
+    assert str(errors) == values
     scored = Score(
         errors.free_run, errors.windows, errors, "run3", np.zeros(1), np.zeros(1), np.inf
     )
-    assert str(scored) == f"RMSE [rad; m] of run3: {told}; limit of these data: {told}"
-    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {told}"
+    assert str(scored) == f"RMSE [rad; m] of run3: {values}; limit of these data: {values}"
+    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {values}"
 
 
-def test_simulations_start_anew_behind_a_gap():
-    """The true model stays as good as the encoder, however long the recording paused."""
+def test_simulations_restart_after_a_gap():
+    """The true model keeps the encoder's error, however long the recording paused."""
     whole = swing(plant(), MODEL, **SETTINGS)
     keep = (whole.time < 1.5) | (whole.time > 1.9)
     gapped = replace(whole, time=whole.time[keep], q=whole.q[keep])
@@ -74,20 +74,20 @@ def test_simulations_start_anew_behind_a_gap():
     assert len(found.simulated) == len(gapped.time)
 
 
-def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
-    """An encoder log that says nothing, on a rig that writes absolute angles from hanging."""
+def test_convention_of_the_recording_precedes_that_of_the_plant():
+    """An encoder log without a convention, on a rig with absolute angles from hanging."""
     hanging = pendulum(convention=("absolute", "hanging"), position_quantum=QUANTUM)
-    said = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
-    unsaid = replace(said, convention=None)
-    q0 = said.convention.position_from_joint(np.array([1.6, 0.8]))
+    stated = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
+    unstated = replace(stated, convention=None)
+    q0 = stated.convention.position_from_joint(np.array([1.6, 0.8]))
     start = {"initial_state": (q0, np.zeros(2)), "horizons": (0.5,)}
-    found = [score(hanging, MODEL, r, **start) for r in (said, unsaid)]
+    found = [score(hanging, MODEL, r, **start) for r in (stated, unstated)]
     assert found[0].free_run == found[1].free_run
     assert found[0].windows == found[1].windows
     assert found[1].free_run.all < QUANTUM
-    # What a recording says counts, whatever the plant says.
-    assert score(plant(), MODEL, said, **start).free_run == found[0].free_run
-    assert score(plant(), MODEL, unsaid, **start).free_run.all > 0.1
+    # The recording's convention applies, whatever the plant's is.
+    assert score(plant(), MODEL, stated, **start).free_run == found[0].free_run
+    assert score(plant(), MODEL, unstated, **start).free_run.all > 0.1
 
 
 def test_metres_are_not_scored_as_angles():
@@ -96,12 +96,12 @@ def test_metres_are_not_scored_as_angles():
         score(plant(), MODEL, recording)
 
 
-def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
+def test_friction_too_steep_to_simulate_diverges_with_a_message(caplog):
     recording = swing(plant(), MODEL, seconds=1.0)
     nan = LFM(2, [1e-3, 1e-3], v_smooth=0.05)
     with torch.no_grad():
         nan.schedule.raw[0, 0] = torch.nan
-    for model, told in (
+    for model, message in (
         (LFM(2, [1e-3, 1e3], v_smooth=1e-3), r"swing: friction needs \d+ integration steps"),
         (nan, "no finite slope"),
     ):
@@ -112,7 +112,7 @@ def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
         assert found.diverged_at == 0.0
         assert found.simulated.shape == recording.q.shape
         assert json.dumps(found.to_dict(), allow_nan=False)
-        assert re.search(told, caplog.text)
+        assert re.search(message, caplog.text)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_bad_input_is_refused(model, settings, error, message):
         score(plant(), model, swing(plant(), MODEL, seconds=0.5), **settings)
 
 
-def test_joints_and_all_are_one_sum_of_squares():
+def test_overall_rmse_is_consistent_with_that_of_the_joints():
     error = np.random.default_rng(0).normal(size=(3, 50, 2)) * [1.0, 3.0]
     rmse = RMSE.of(error)
     assert rmse.all == pytest.approx(np.sqrt(np.mean(error**2)))
@@ -140,8 +140,8 @@ def test_joints_and_all_are_one_sum_of_squares():
     assert found.all == pytest.approx(np.sqrt(np.mean(np.square(found.joints))))
 
 
-def test_windows_are_those_that_fit(monkeypatch):
-    """9.98 s are two windows of 5 s, nine hundredths of a second do not count as lost."""
+def test_windows_are_counted_by_the_recording_length(monkeypatch):
+    """9.98 s are two windows of 5 s; a shortage of 0.02 s is tolerated."""
     starts = {}
 
     def counted(plant, friction, q0, *rest, **settings):
@@ -158,11 +158,11 @@ def test_windows_are_those_that_fit(monkeypatch):
     assert list(found.windows) == ["2", "5"]
     assert found.limit is None
     assert starts[5] == 2
-    # The first begins behind its lead-in.
+    # The first window begins after its lead-in.
     assert starts[2] == 4
 
 
-def test_the_limit_scales_with_the_encoder_s_count():
+def test_limit_scales_with_the_encoder_resolution():
     fine = swing(plant(), MODEL, seconds=1.5, start=(2.8, 0.3))
     coarse = replace(fine, q=quantise(fine.q, 2048))
     limits = [
@@ -173,11 +173,11 @@ def test_the_limit_scales_with_the_encoder_s_count():
         assert QUANTUM / 12**0.5 < min(each) <= max(each) < 20 * QUANTUM
     ratio = limits[1].free_run.all / limits[0].free_run.all
     assert 2 < ratio < 8
-    # Where the count is unknown, positions show it.
+    # If the resolution is unknown, it is estimated from positions.
     assert limits[2].free_run.all == pytest.approx(limits[1].free_run.all, rel=0.5)
 
 
-def test_samples_that_are_scored_do_not_influence_the_start():
+def test_scored_samples_do_not_influence_the_initial_state():
     recording = swing(plant(), MODEL, seconds=3.0, sample_time=4e-3)
     lead, noise = lead_in_samples(recording), np.random.default_rng(0)
     assert lead == 50
@@ -201,8 +201,8 @@ def test_samples_that_are_scored_do_not_influence_the_start():
         np.testing.assert_array_equal(again.q[window], runs.q[window])
 
 
-def test_the_start_is_as_well_known_as_its_covariance_says():
-    """Errors of estimated starts of a known motion, in standard deviations, are near 1."""
+def test_covariance_of_the_initial_state_matches_its_errors():
+    """Errors of estimated initial states of a known motion have about unit normalised variance."""
     deviations = []
     for k in range(20):
         rig, recording, truth = release(k)
@@ -221,12 +221,12 @@ def test_scores_of_the_true_model_are_below_the_limit():
 
 
 @pytest.mark.slow
-def test_scores_of_the_true_model_are_below_the_limit_in_95_of_100_releases():
+def test_true_model_is_below_the_limit_in_95_of_100_releases():
     assert below_the_limit(range(100)) >= 95
 
 
-def test_the_limit_knows_the_noise_of_the_torque():
-    """A fine encoder on an axis: torques as recorded lead even the true law astray."""
+def test_limit_includes_torque_noise():
+    """A fine encoder on an axis: noise in the recorded torques perturbs even the true law."""
     axis = LinearAxis(0.1, position_quantum=1e-6)
     friction = CVFM(1, [[0.3, 0.1]]).requires_grad_(False)
     time, rest = 2e-3 * np.arange(1501), torch.zeros(1, dtype=torch.float64)
@@ -237,13 +237,13 @@ def test_the_limit_knows_the_noise_of_the_torque():
         noise = 0.02 * np.random.default_rng(seed).standard_normal(tau.shape)
         found = score(axis, friction, Recording(time, run.q.numpy(), tau + noise, unit="m"))
         within += found.free_run.all <= found.limit.free_run.all
-        # Not by being wide.
+        # The limit is not just wide.
         assert found.limit.free_run.all < 10 * found.free_run.all
     assert within >= 5
 
 
-def test_the_limit_knows_the_integration():
-    """A fine encoder shows that steep friction is simulated by few steps."""
+def test_limit_includes_the_integration_error():
+    """With a fine encoder, the integration error of steep friction in few steps is visible."""
     axis, friction = LinearAxis(0.5), CVFM(1, [0.4, 0.1], v_smooth=3e-3)
     tau = 1.5 * torch.sin(2e-2 * torch.arange(1500.0, dtype=torch.float64))[:, None]
     zero = torch.zeros(1, dtype=torch.float64)
@@ -254,8 +254,8 @@ def test_the_limit_knows_the_integration():
     assert 0.2 * found.limit.free_run.all < found.free_run.all <= found.limit.free_run.all
 
 
-def test_the_limit_knows_the_rounding_that_only_the_recording_shows():
-    """A joint held by friction reads a constant, up to half a count off."""
+def test_limit_includes_the_quantisation_seen_in_the_recording():
+    """A joint held by friction reads a constant, with an error of up to half a count."""
     friction = CVFM(2, [[5e-2, 2e-3], [2e-2, 2e-3]], v_smooth=0.01).requires_grad_(False)
     recording = swing(plant(), friction, **SETTINGS | {"start": (2.8, 0.3)})
     stated, shown = (
@@ -266,13 +266,13 @@ def test_the_limit_knows_the_rounding_that_only_the_recording_shows():
 
 
 def below_the_limit(seeds: Iterable[int]) -> int:
-    """Number of random releases whose score by the true model is within the limit."""
+    """Number of random releases in which the true model's score is within the limit."""
     scores = (score(rig, MODEL, r, horizons=()) for rig, r, _ in map(release, seeds))
     return sum(found.free_run.all <= found.limit.free_run.all for found in scores)
 
 
 def release(seed: int) -> tuple[PendulumChain, Recording, np.ndarray]:
-    """A random motion of 4 s, every other one driven, as an encoder reads it, and its start."""
+    """A random motion of 4 s, every other one driven, as sampled by an encoder, and its start."""
     random = np.random.default_rng(seed)
     time = 2e-3 * np.arange(2001)
     tau = np.zeros((2001, 2))
@@ -289,7 +289,7 @@ def release(seed: int) -> tuple[PendulumChain, Recording, np.ndarray]:
     return plant(), recording, np.concatenate([q0, qd0])
 
 
-def test_a_recording_without_room_for_a_lead_in_is_refused():
+def test_recording_too_short_for_a_lead_in_is_refused():
     short = swing(plant(), MODEL, seconds=0.15)
     with pytest.raises(ValueError, match=r"swing is too short to be scored: .* lead-in of 0.2 s"):
         score(plant(), MODEL, short)
@@ -304,7 +304,7 @@ def test_divergence_is_infinite_and_null(caplog):
     assert found.free_run.all == np.inf
     assert 0 < found.diverged_at < 1.0
     assert found.limit.free_run.all == found.limit.windows["0.5"].all == np.inf
-    # Once of the free run and of the windows, and not of every start that is tried.
+    # Once for the free run and once for the windows, not for every initial state that is tried.
     assert caplog.text.count("diverged") < 10
     plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert plain["free_run"] == {"joints": [None, None], "all": None}
@@ -333,7 +333,7 @@ def test_tables_are_root_mean_squares_and_percentages():
     assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None
 
 
-def test_a_path_and_the_name_of_a_rig_do(tmp_path):
+def test_path_and_rig_name_are_accepted(tmp_path):
     time = np.arange(300) * 2e-3
     recording = Recording(time, 0.01 * np.sin(time)[:, None], convention="relative,hanging")
     recording.write(tmp_path / "run.csv")
@@ -343,7 +343,8 @@ def test_a_path_and_the_name_of_a_rig_do(tmp_path):
 
 
 def zeroed_in_a_pose(zero, seconds=3.0):
-    """A driven double pendulum held off its balance by friction, where its encoders were zeroed."""
+    """A driven double pendulum, held away from equilibrium by friction when its encoders were
+    zeroed."""
     rig = pendulum(position_quantum=QUANTUM)
     law = CVFM(2, [[2e-3, 0.02], [1e-3, 0.01]], v_smooth=0.01)
     time = np.arange(0.0, seconds, 2e-3)
@@ -358,7 +359,7 @@ def zeroed_in_a_pose(zero, seconds=3.0):
     return rig, law, Recording(time, q - hanging, tau, convention="relative,hanging")
 
 
-def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
+def test_encoder_offset_is_estimated_from_samples_that_are_not_scored():
     zero = np.array([0.02, -0.03])
     rig, law, recording = zeroed_in_a_pose(zero)
     rest = (recording.q[0], np.zeros(2))
@@ -378,28 +379,28 @@ def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
     assert other.free_run.all == pytest.approx(0.1, rel=0.05)
 
 
-def test_a_recording_without_any_error_has_a_zero_of_zero():
-    """As of a simulation that is scored by the model and the steps that made it."""
+def test_recording_without_error_has_zero_encoder_offset():
+    """As of a simulation that is scored by its own model and step size."""
     rig, law, recording = zeroed_in_a_pose(np.zeros(2))
     (run,) = Simulator(rig, law, recording, "rk4", 0).free_runs((recording.q[0], np.zeros(2)))
     found = score(rig, law, recording._replace(q=run.q[0]), limit=False, zeroed=True)
     assert found.zero == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
-def test_the_limit_knows_how_uncertain_the_zero_is():
+def test_limit_includes_the_uncertainty_of_the_encoder_offset():
     rig, law, recording = zeroed_in_a_pose(np.zeros(2))
     limits = []
     for sd in (0.0, 0.02):
         zero = Zero(np.zeros(2), sd * np.eye(2))
         (run,) = Simulator(rig, law, recording, "rk4", 20, zero).free_runs(None)
         limits.append(np.sqrt(run.squares.mean(-1).max()))
-    # Of unlike poses the motions differ, though the encoders read the same at first.
+    # Motions from different poses differ, although the encoders read the same at first.
     assert limits[1] > 3 * limits[0]
     rest = (recording.q[0], np.zeros(2))
     assert 1e-6 < np.linalg.norm(estimate_zero(rig, law, recording, rest).root, axis=1).max() < 0.02
 
 
-def test_a_recording_whose_zero_does_not_show_is_taken_as_it_is():
+def test_unidentifiable_encoder_offset_is_left_at_zero():
     rig, law, recording = zeroed_in_a_pose(np.array([0.02, -0.03]))
     rows = np.r_[:3, 200:1500]
     with pytest.warns(RecordingWarning, match="gap"):
@@ -413,14 +414,14 @@ def test_a_recording_whose_zero_does_not_show_is_taken_as_it_is():
         assert found.free_run == score(*given, limit=False, horizons=()).free_run
 
 
-def test_a_state_of_fewer_joints_is_refused_where_the_zero_is_estimated():
+def test_initial_state_with_too_few_joints_is_refused():
     rig, law, recording = zeroed_in_a_pose(np.zeros(2))
     with pytest.raises(ValueError, match=r"`initial_state` must be q0 and qd0 of shape \(2,\)"):
         score(rig, law, recording, initial_state=([0.0], [0.0, 0.0]), limit=False, zeroed=True)
 
 
-def test_a_joint_at_rest_is_held_by_its_bristles_from_the_start():
-    """Undeflected ones would let it sink by the displacement over which they yield."""
+def test_joint_at_rest_starts_with_deflected_bristles():
+    """Undeflected bristles would let it sink by the presliding displacement."""
     count, stiffness = 2 * np.pi / 8192, 60.0
     plant = PendulumChain(mass=[1.0], length=[0.3], position_quantum=count)
     friction = model_by_name("dahl")(1, (0.6, 0.05, stiffness)).requires_grad_(False)

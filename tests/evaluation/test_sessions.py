@@ -1,4 +1,4 @@
-"""Friction over many sessions: the mean, the spread between them, and the next session."""
+"""Friction over several sessions: mean, spread between sessions, prediction for the next one."""
 
 import math
 
@@ -32,7 +32,7 @@ def session(coefficients: np.ndarray) -> Recording:
     return Recording(0.01 * np.arange(401), q, convention="relative,upright")
 
 
-def test_the_spread_between_sessions_is_found_beside_the_mean(tmp_path):
+def test_mean_and_spread_between_sessions_are_recovered(tmp_path):
     rng = np.random.default_rng(0)
     truth = np.array([0.02, 0.006]) * (1 + 0.2 * rng.normal(size=(6, 2)))
     sessions = {f"day {k}": session(c) for k, c in enumerate(truth)}
@@ -51,7 +51,7 @@ def test_the_spread_between_sessions_is_found_beside_the_mean(tmp_path):
     assert found.to_pandas().loc["F_c of joint1", "sessions"] == 6
 
 
-def test_a_session_that_fails_is_listed(tmp_path):
+def test_failed_session_is_listed(tmp_path):
     sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(3)}
     sessions["lost"] = tmp_path / "missing.csv"
     found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5,), drag=False)
@@ -62,7 +62,7 @@ def test_a_session_that_fails_is_listed(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_stiffness_of_contacts_has_a_spread() -> None:
+def test_contact_stiffness_has_a_spread() -> None:
     axis, sessions, truth = LinearAxis(0.5), {}, {"a": 250.0, "b": 300.0, "c": 380.0}
     time = 2e-3 * np.arange(2001)
     tau = ((0.7 + 2.0 * np.sin(math.pi * time / 4) ** 2) * np.sin(7 * time))[:, None]
@@ -77,7 +77,7 @@ def test_the_stiffness_of_contacts_has_a_spread() -> None:
     assert spread.between == pytest.approx(65.6, rel=0.1)
 
 
-def test_what_cannot_have_a_spread_is_refused():
+def test_inputs_without_a_defined_spread_are_refused():
     one = session(np.array([0.02, 0.006]))
     with pytest.raises(ValueError, match="at least 3 sessions, got 1"):
         fit_sessions(CVFM(1), PLANT, {"a": one})
@@ -98,7 +98,7 @@ def test_intervals_cover_the_mean_and_the_next_session():
     assert 0.88 <= next_hit / trials <= 0.98
 
 
-def test_without_spread_errors_alone_decide():
+def test_without_spread_only_estimation_errors_count():
     rng = np.random.default_rng(0)
     sd = np.full(200, 0.1)
     found = random_effects("x", 1 + sd * rng.normal(size=200), sd)
@@ -106,13 +106,13 @@ def test_without_spread_errors_alone_decide():
     assert found.high - found.low == pytest.approx(2 * 1.97 * 0.1 / math.sqrt(200), rel=0.3)
 
 
-def test_a_parameter_that_few_sessions_determine_has_no_interval():
+def test_parameter_determined_in_few_sessions_has_no_interval():
     found = random_effects("x", np.ones(5), np.array([0.1, 0.1, *[math.inf] * 3]))
     assert math.isnan(found.mean)
     assert (found.next_low, found.next_high) == (-math.inf, math.inf)
 
 
-def test_coefficients_that_are_not_fitted_stay_in_the_mean_model():
+def test_fixed_coefficients_are_kept_in_the_mean_model():
     rng, sessions = np.random.default_rng(0), {}
     for k in range(3):
         one = session(np.array([0.02, 0.006]) * (1 + 0.1 * rng.normal(size=2)))
@@ -125,10 +125,10 @@ def test_coefficients_that_are_not_fitted_stay_in_the_mean_model():
     assert float(values[2]) == pytest.approx(means["F_v of joint1"])
 
 
-def test_a_session_whose_fit_is_not_to_be_used_does_not_count():
+def test_session_with_an_unusable_fit_is_excluded():
     sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(4)}
     sound = sessions["day 1"]
-    # Time runs backwards: the motion gains energy.
+    # With reversed time, the motion gains energy.
     sessions["day 1"] = Recording(sound.time, sound.q[::-1], convention=sound.convention)
     found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5,), drag=False)
     assert list(found.failed) == ["day 1"]

@@ -36,7 +36,7 @@ def motion(rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def coloured(rows: int, sd: float, memory: float, rng: np.random.Generator) -> np.ndarray:
-    """Autoregressive noise of one lag."""
+    """First-order autoregressive noise."""
     found = np.empty(rows)
     found[0] = rng.normal(0, sd)
     for k in range(1, rows):
@@ -53,7 +53,7 @@ def stribeck_table(rows: int = 1500, seed: int = 0, sd: float = 0.05) -> pd.Data
     )
 
 
-def test_known_coefficients_are_found_within_their_intervals() -> None:
+def test_known_coefficients_are_recovered_within_their_intervals() -> None:
     found = fit_torque(stribeck_table(), "viscous, coulomb-viscous, stribeck")
     assert found.chosen == {"joint1": "Stribeck"}
     table = found.intervals()
@@ -66,7 +66,7 @@ def test_known_coefficients_are_found_within_their_intervals() -> None:
 
 
 def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
-    """White-noise intervals would cover about a half here: the noise lasts 20 rows."""
+    """White-noise intervals would cover only about half here: the correlation time is 20 rows."""
     rng, inside, wide = np.random.default_rng(5), 0, 0.0
     for seed in range(60):
         time, qd = motion(800, seed)
@@ -77,12 +77,12 @@ def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
             inside += interval.low < true < interval.high
             wide += interval.high - interval.low
     assert inside >= 0.88 * 120
-    # Nor are they wider than the noise makes the estimates scatter, times some.
+    # Nor are they much wider than the scatter of the estimates.
     assert wide / 120 < 0.6
 
 
 @pytest.mark.slow
-def test_a_network_is_kept_where_friction_follows_the_acceleration_and_only_there() -> None:
+def test_network_is_kept_only_if_friction_depends_on_acceleration() -> None:
     time, qd = motion(1200, 3)
     qdd = np.gradient(qd, time)
     noise = np.random.default_rng(0).normal(0, 0.02, 1200)
@@ -101,7 +101,7 @@ def test_a_network_is_kept_where_friction_follows_the_acceleration_and_only_ther
     assert steady.chosen["joint1"] == "CVFM"
 
 
-def test_rows_in_no_order_are_dealt_by_velocity() -> None:
+def test_unordered_rows_are_split_by_velocity() -> None:
     qd = np.repeat(np.linspace(-1, 1, 40), 5)
     table = TorqueTable.from_pandas(pd.DataFrame({"qd": qd, "tau": qd}))
     parts = blocks(table.joints[0], 4)
@@ -120,7 +120,7 @@ def two_joints() -> pd.DataFrame:
     })  # fmt: skip
 
 
-def test_of_few_rows_each_is_left_out_once() -> None:
+def test_few_rows_are_left_out_one_at_a_time() -> None:
     qd = np.array([-1.0, -0.7, -0.4, -0.1, 0.1, 0.4, 0.7, 1.0])
     tau = 0.3 * np.sign(qd) + 0.1 * qd + 1e-3 * np.random.default_rng(0).normal(size=8)
     found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "coulomb-viscous", folds=10)
@@ -128,7 +128,7 @@ def test_of_few_rows_each_is_left_out_once() -> None:
     assert 0 < found.to_frame().loc["joint1", "CVFM"] < 0.02
 
 
-def test_a_peak_below_the_slowest_velocity_is_no_higher_than_the_friction() -> None:
+def test_peak_below_the_slowest_velocity_is_bounded_by_the_friction() -> None:
     qd = np.repeat([-2.0, -1.0, -0.5, 0.5, 1.0, 2.0], 40)
     truth = np.sign(qd) * (1.2 + 0.5 / (1 + (qd / 0.3) ** 2)) + 0.35 * qd
     for sd in (0.0, 0.05):
@@ -138,7 +138,7 @@ def test_a_peak_below_the_slowest_velocity_is_no_higher_than_the_friction() -> N
         assert coulomb + peak < 2.2
 
 
-def test_every_file_of_a_run_predicts_as_the_fit_does(tmp_path: Path) -> None:
+def test_every_file_of_a_run_gives_the_predictions_of_the_fit(tmp_path: Path) -> None:
     table = two_joints()
     models = "coulomb-viscous,load-coulomb,stribeck,neuro-fuzzy:coulomb"
     found = fit_torque(table, models)
@@ -179,7 +179,7 @@ def test_split_and_join_are_inverse() -> None:
         assert torch.equal(value, again.state_dict()[name])
 
 
-def test_models_that_a_table_cannot_show_are_refused_with_the_reason() -> None:
+def test_models_unsuitable_for_a_table_are_refused_with_the_reason() -> None:
     table = stribeck_table()
     found = fit_torque(table, ["coulomb-viscous", "load-coulomb", "adaptive:viscous"])
     assert list(found.fits) == ["CVFM"]
@@ -199,7 +199,7 @@ def test_models_that_a_table_cannot_show_are_refused_with_the_reason() -> None:
         fit_torque(3)
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_folder_of_another_kind_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no folder written by fit-torque"):
         read_models(tmp_path)
     (tmp_path / "results.json").write_text('{"chosen": 3}')
@@ -208,7 +208,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sd", [0.0, 0.02])
-def test_rows_far_off_and_a_shape_that_no_law_has_are_remarked(sd: float) -> None:
+def test_outliers_and_misfit_of_all_laws_are_reported(sd: float) -> None:
     rng = np.random.default_rng(3)
     qd = rng.uniform(-10, 10, 200)
     noise = sd * rng.normal(size=200)
@@ -225,7 +225,7 @@ def test_rows_far_off_and_a_shape_that_no_law_has_are_remarked(sd: float) -> Non
     assert "follows the velocity" in remark
 
 
-def test_a_constant_friction_beside_that_of_the_load_is_remarked() -> None:
+def test_load_independent_friction_is_reported() -> None:
     rng = np.random.default_rng(0)
     load, qd = rng.uniform(0, 2, 60), rng.choice([-1, 1], 60) * rng.uniform(0.3, 8, 60)
     noise = 0.002 * rng.normal(size=60)
@@ -236,7 +236,7 @@ def test_a_constant_friction_beside_that_of_the_load_is_remarked() -> None:
         assert all("follows the velocity and the load" in remark for remark in remarks)
 
 
-def test_rows_at_rest_are_left_out() -> None:
+def test_rows_at_rest_are_excluded() -> None:
     rng = np.random.default_rng(0)
     qd = np.r_[np.zeros(200), np.repeat([-4, -2, -1, -0.5, 0.5, 1, 2, 4], 10)]
     sliding = 0.1 * np.sign(qd) + 0.02 * qd + 0.002 * rng.normal(size=280)
@@ -265,7 +265,7 @@ def speeds(rows: int = 10, noise: float = 0.01, seed: int = 0, ramp: float = 0.0
 LAWS = "viscous,coulomb-viscous,stribeck"
 
 
-def test_copies_of_rows_do_not_narrow_the_intervals() -> None:
+def test_duplicated_rows_do_not_narrow_the_intervals() -> None:
     once = speeds(1)[["qd", "tau"]]
     five = fit_torque(pd.concat([once] * 5), "stribeck")
     assert "64 of 80 rows of joint1 equal others in every column" in five.table.remarks[0]
@@ -274,9 +274,7 @@ def test_copies_of_rows_do_not_narrow_the_intervals() -> None:
 
 @pytest.mark.parametrize("rows", [1, 20])
 @pytest.mark.parametrize("timed", [True, False])
-def test_an_offset_and_friction_that_differs_by_direction_are_remarked(
-    rows: int, timed: bool
-) -> None:
+def test_offset_and_direction_dependent_friction_are_reported(rows: int, timed: bool) -> None:
     table = speeds(rows)
     table = table if timed else table.drop(columns="time")
     (remark,) = fit_torque(table.assign(tau=table.tau + 0.1), LAWS).table.remarks
@@ -288,17 +286,17 @@ def test_an_offset_and_friction_that_differs_by_direction_are_remarked(
     assert "lower in the negative direction than in the positive" in remark
 
 
-def test_sound_tables_have_no_cause_of_error() -> None:
+def test_sound_tables_raise_no_warning() -> None:
     for seed in range(40):
         for table in (speeds(1, seed=seed).drop(columns="time"), speeds(10, seed=seed)):
             remarks = fit_torque(table, "stribeck", folds=2).table.remarks
             assert not any("offset" in r or "direction" in r or "accel" in r for r in remarks)
 
 
-def test_phases_of_acceleration_are_remarked() -> None:
+def test_acceleration_phases_are_reported() -> None:
     (remark,) = fit_torque(speeds(300, ramp=5.0), LAWS).table.remarks
     assert "at joint1 follows the acceleration, as with an inertia of 0.0" in remark
-    # Without time, they are at least no single mistakes.
+    # Without time stamps, they are at least not reported as single outliers.
     both = pd.concat([speeds(200, ramp=20.0), speeds(200, seed=1, ramp=-20.0)])
     (remark,) = fit_torque(both.drop(columns="time"), LAWS).table.remarks
     assert remark.startswith("412 of 6400 torques are far off ")
@@ -313,7 +311,7 @@ def test_summary_and_notebook_show_choice_and_intervals() -> None:
     assert found.plot().axes[0].get_title() == "joint1: stribeck"
 
 
-def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
+def test_rejected_network_is_not_chosen_over_its_law() -> None:
     law = Candidate("CVFM", (1.0, 1.0), 2, True)
     network = Candidate("NFCVFM", (1.0, 1.0 - 1e-12), 2, True)
     assert _choose([network, law])[0] == _choose([law, network])[0] == "CVFM"
@@ -321,10 +319,10 @@ def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
 
 
 @pytest.mark.parametrize("speeds", [(0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 0.6, 1.0, 2.0, 4.0)])
-def test_noise_of_repeats_chooses_no_law_of_more_coefficients(speeds: tuple[float, ...]) -> None:
-    """Few speeds do not show the shape of a curve, however often each is repeated."""
+def test_noise_in_repeated_rows_does_not_select_a_larger_law(speeds: tuple[float, ...]) -> None:
+    """A few speeds do not show the shape of a curve, however often each is repeated."""
     rng = np.random.default_rng(5)
-    # A drive holds a speed within a per mille.
+    # A drive keeps its speed to 0.1 %.
     qd = np.repeat(speeds, 5) * (1 + 1e-3 * rng.standard_normal(5 * len(speeds)))
     tau = 1.0 + 0.2 * qd + 0.05 * rng.standard_normal(len(qd))
     found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "coulomb-viscous,arctan,stribeck")
@@ -338,9 +336,9 @@ def test_noise_of_repeats_chooses_no_law_of_more_coefficients(speeds: tuple[floa
     assert peak.chosen["joint1"] == ("CVFM" if hidden else "Stribeck")
 
 
-def test_memory_and_load_have_to_gain_more_than_the_blocks_scatter() -> None:
+def test_memory_and_load_must_improve_by_more_than_the_block_scatter() -> None:
     plain = Candidate("CVFM", (1.0, 1.2, 0.8, 1.1, 0.9, 2.0), 2, True)
-    # A single block gains.
+    # Only one block improves.
     once = Candidate("Slip", (1.0, 1.2, 0.8, 1.1, 0.9, 1.4), 9, True)
     steady = Candidate("Slip", (0.5, 0.7, 0.4, 0.6, 0.5, 1.0), 9, True)
     loaded = Candidate("LoadSlip", (0.4, 0.8, 0.3, 0.5, 0.5, 0.9), 9, True)

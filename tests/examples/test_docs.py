@@ -1,4 +1,4 @@
-"""The documentation names only what there is: commands parse, code compiles, names resolve."""
+"""The documentation is consistent with the code: commands parse, code compiles, names resolve."""
 
 import importlib
 import math
@@ -44,14 +44,14 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
-def test_links_of_the_readme_lead_somewhere_in_the_repository() -> None:
+def test_links_of_the_readme_exist_in_the_repository() -> None:
     targets = re.findall(r"\]\(([^)#]+)", README.read_text(encoding="utf-8"))
     assert len(targets) > 5
     assert [t for t in targets if not t.startswith("http") and not (ROOT / t).exists()] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_links_and_figures_of_every_page_are_there(page: Path) -> None:
+def test_links_and_figures_of_every_page_exist(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
     text = re.sub(r"`[^`]*`", "", text)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
@@ -60,7 +60,7 @@ def test_links_and_figures_of_every_page_are_there(page: Path) -> None:
         assert not section or f"[start:{section}]" in (ROOT / name).read_text(encoding="utf-8")
 
 
-def test_the_reference_of_commands_has_every_command_and_option() -> None:
+def test_command_reference_has_every_command_and_option() -> None:
     hooks = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
     page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     text = hooks["on_page_markdown"](page)
@@ -75,7 +75,7 @@ def test_the_reference_of_commands_has_every_command_and_option() -> None:
     assert all(row.count("|") == 3 for row in rows)
 
 
-def test_the_reference_of_rigs_has_every_key() -> None:
+def test_rig_reference_has_every_key() -> None:
     text = (ROOT / "docs" / "reference" / "rig_keys.md").read_text(encoding="utf-8")
     kinds = text.split("\n## ")[1:]
     named = [set(re.findall(r"`(\w+)`", kind)) for kind in kinds]
@@ -84,7 +84,7 @@ def test_the_reference_of_rigs_has_every_key() -> None:
     assert {field.name for field in fields(Motor)} <= named[3]
 
 
-def test_shapes_are_not_set_in_italics() -> None:
+def test_shapes_are_not_rendered_in_italics() -> None:
     markdown = pytest.importorskip("markdown", reason="`pip install .[docs]` to run this")
     pytest.importorskip("pymdownx", reason="`pip install .[docs]` to run this")
     assert "pymdownx.betterem: {smart_enable: all}" in (ROOT / "mkdocs.yml").read_text()
@@ -96,7 +96,7 @@ def test_shapes_are_not_set_in_italics() -> None:
     assert "<em>" not in html
 
 
-def test_there_are_pages_and_commands() -> None:
+def test_pages_and_commands_are_found() -> None:
     assert len(PAGES) > 10
     assert len(commands()) > 8
 
@@ -119,7 +119,7 @@ def test_commands_parse(
 
 
 @pytest.mark.parametrize(("page", "block"), list(blocks("python")))
-def test_code_compiles_and_imports_what_there_is(page: str, block: str) -> None:
+def test_code_compiles_and_its_imports_exist(page: str, block: str) -> None:
     snippets = re.findall(r'^--8<-- "(.*)"$', block, re.MULTILINE)
     assert len(snippets) == block.count("--8")
     for snippet in snippets:
@@ -139,7 +139,7 @@ REFERENCES = [
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_the_reference_describes_what_there_is(name: str) -> None:
+def test_reference_describes_existing_objects(name: str) -> None:
     thing, parts = importlib.import_module("nfriction"), name.split(".")
     for k, part in enumerate(parts[1:], 2):
         if not hasattr(thing, part):
@@ -148,7 +148,7 @@ def test_the_reference_describes_what_there_is(name: str) -> None:
     assert thing.__doc__
 
 
-def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() -> None:
+def test_pages_are_in_the_menu_and_figure_functions_in_the_reference() -> None:
     menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     for page in PAGES:
         assert page.relative_to(ROOT / "docs").as_posix() in menu
@@ -158,7 +158,7 @@ def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() 
     assert set(plots.__all__) - described <= {"save_all"}
 
 
-# What the commands of pages need beforehand, and how their readers come by it.
+# Preparation of the pages' commands, and how readers get the files.
 TWIN = """nfriction twin --seconds 5 --out twin
     for k in 1 2; do gunzip -c twin/train_*$k.csv.gz > run$k.csv; done
     gunzip -c twin/test_1.csv.gz > run3.csv; cp twin/rig.json ."""
@@ -184,7 +184,7 @@ SESSIONS = [
         "from_the_papers.md",
     )
 ]  # fmt: skip
-# They need a robot file of the reader's, a network, make, or minutes that another test takes.
+# They need a user's robot file, a network, make, or minutes that another test takes.
 NOT_RUN = (
     'rig = rigs.read("robot.urdf")', "nfriction: error: arm.urdf", "nfriction data get",
     "cd data/", "make demo", "Without friction, simulations of the test",
@@ -279,7 +279,7 @@ def shown_at(place: int, shown: list[str], printed: list[str]) -> bool:
 
 
 @pytest.mark.slow
-def test_the_demo_ends_as_the_readme_shows(
+def test_demo_output_matches_the_readme(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

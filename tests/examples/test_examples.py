@@ -1,4 +1,4 @@
-"""Every example runs with its tiny horizon, through the public API only."""
+"""Every example runs with a tiny horizon and only the public API."""
 
 import ast
 import json
@@ -14,7 +14,7 @@ EXAMPLES = sorted(FOLDER.glob("*.py"))
 # The package itself, and subpackages whose `__all__` is public.
 PUBLIC = {"friction", "fuzzy", "fitting", "papers", "report", "signals", "simulation"}
 
-# What the last lines of each must say, so that a silent failure is none.
+# Text required in the last lines of each output, so that a silent failure is detected.
 SAID = {
     "export_to_c": "selftest",
     "feedforward": "compensated: the true one",
@@ -30,27 +30,27 @@ SAID = {
 
 
 def compensation_reduces_the_error(printed: str) -> bool:
-    """A better model of the friction leaves a smaller tracking error, and the true one least."""
+    """A better friction model has a smaller tracking error, and the true one the smallest."""
     errors = [float(x) for x in re.findall(r"tracking error +([\d.]+) mrad", printed)]
     none, *learnt, true = errors
     return errors == sorted(errors, reverse=True) and max(learnt) < 0.1 * none and true > 0
 
 
 def five_coefficients_are_best(printed: str) -> bool:
-    """The RTIP paper's claim holds on either recording, for the sum over the joints."""
+    """The RTIP paper's claim is true of either recording, for the sum over the joints."""
     rows = re.findall(r"^(\w+), (\w+) +([\d.]+) +([\d.]+) +([\d.]+)$", printed, re.MULTILINE)
     total = {(model, kind): sum(map(float, joints)) for model, kind, *joints in rows}
     kinds = ("fitted", "test", "printed")
     return all(total["NLFM", k] < min(total["NCFM", k], total["LFM", k]) for k in kinds)
 
 
-# What more the printed numbers must satisfy.
+# Further conditions on the printed numbers.
 LAWS = {
     "feedforward": compensation_reduces_the_error,
     "rtip_table_4": five_coefficients_are_best,
 }
 
-# What some need beyond the package.
+# Packages that some need in addition.
 NEEDS = {"many_fits_on_dask": ("dask", "distributed", "joblib")}
 
 
@@ -65,7 +65,9 @@ RUNS = [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem i
 
 
 @pytest.mark.parametrize("path", RUNS)
-def test_runs_quickly(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_run_quickly(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for library in NEEDS.get(path.stem, ()):
         pytest.importorskip(library, reason="`pip install nfriction[dask]` to run this")
     torch.set_num_threads(1)
@@ -99,7 +101,7 @@ def test_notebooks_run_from_top_to_bottom(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_is_short_and_uses_what_is_public(path: Path) -> None:
+def test_examples_are_short_and_use_only_the_public_api(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 75
     for node in ast.walk(ast.parse(text)):

@@ -1,4 +1,4 @@
-"""Models, ranges and schedules to export in tests, and what runs artefacts as they are."""
+"""Models, ranges and schedules for export tests, and a runner for our own artefacts."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ INFO = ModelInfo(
 
 
 class Rising(Constant):
-    """Coefficients that grow with speed and acceleration for ever: one that has no range."""
+    """Coefficients that grow without bound with speed and acceleration, and have no range."""
 
     handles_range = False
 
@@ -34,14 +34,14 @@ class Rising(Constant):
 
 
 def rising(joints: int = 3, law: Law = LINEAR) -> FrictionModel:
-    """A model with a schedule of a user's own, which must be clamped from outside."""
+    """A model with a user-defined schedule, which must be clamped from outside."""
     model = FrictionModel(law, Rising(law, joints, [1e-3, 2e-3]))
     randomise(model, 0.3)
     return model
 
 
 def runner_of(path: Path, controller: Controller, dtype: str = "float64") -> Runner:
-    """Run an artefact of our own, so that its program need not be compared with a new one."""
+    """Run one of our own artefacts without comparing its program with a new one."""
     if path.suffix == ".onnx":
         return onnx_file._runner(onnx_file._read(path), controller, dtype, path)
     with torch_files.silent():

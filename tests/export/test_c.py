@@ -1,4 +1,4 @@
-"""Exported C: strict C89 and C++, equal to its model, and true to the contract at the edges."""
+"""Exported C: strict C89 and C++, equal to its model, and within the contract at the edges."""
 
 import re
 import shutil
@@ -34,9 +34,9 @@ pytestmark = pytest.mark.skipif(not (GCC and GXX), reason="needs gcc and g++")
 STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
 C89 = ["gcc", "-std=c89", "-pedantic", *STRICT]
 CXX = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
-# Of full scale. A double rounds to 1e-16 and sums of some dozen terms come before the torque.
+# Relative to full scale. A double rounds to 1e-16, and the torque sums some dozens of terms.
 TOLERANCE = {"float64": 1e-14, "float32": 5e-7}
-# Constants of the size that the papers' rigs have.
+# Constants of the size of the papers' rigs.
 INITIAL = {
     "viscous": [0.02],
     "coulomb": [0.05],
@@ -53,7 +53,7 @@ INFO = ModelInfo(
 
 
 def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
-    """A named model, every parameter off its start."""
+    """A named model with every parameter changed from its initial value."""
     random = torch.Generator().manual_seed(seed)
     kind = model_by_name(name)
     initial = INITIAL[kind(1).law.name]
@@ -67,7 +67,7 @@ def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Exports the named models, each once a dtype; gives model, controller and folder."""
+    """Export the named models, each once per dtype, and return model, controller and folder."""
 
     @cache
     def export(name: str, dtype: str, **options):
@@ -129,9 +129,9 @@ def test_is_valid_cpp(exported, name, dtype):
 
 @cases
 @few
-def test_equals_its_model_to_beyond_the_range(exported, name, dtype):
+def test_equals_its_model_within_and_beyond_the_range(exported, name, dtype):
     _, controller, folder = exported(name, dtype)
-    # Models with a memory are stepped through one sample at a time in torch.
+    # Models with a hidden state are stepped one sample at a time in torch.
     inputs = points(controller, dtype, 500 if controller.state_size else 5000)
     run = c_runner(folder / "nfriction.c")
     parity = compare(controller.run(*inputs), run(*inputs), TOLERANCE[dtype])
@@ -173,7 +173,7 @@ def test_the_self_test_can_fail(exported, tmp_path):
 @cases
 @pytest.mark.parametrize("flags", [("-O0",), ("-O3", "-ffast-math")])
 @pytest.mark.parametrize("name", ["NFLFM", "ALFM"])
-def test_what_is_not_finite_stays_with_its_joint(exported, name, dtype, flags):
+def test_non_finite_inputs_affect_only_their_joint(exported, name, dtype, flags):
     _, controller, folder = exported(name, dtype)
     run = c_runner(folder / "nfriction.c", flags)
     sound = [x[:1] for x in points(controller, dtype, 1)]
@@ -191,7 +191,7 @@ def test_what_is_not_finite_stays_with_its_joint(exported, name, dtype, flags):
                 assert status[0, joint] == clean[2][0, joint]
 
 
-def test_running_fast_math_leaves_this_process_alone(exported):
+def test_fast_math_does_not_affect_this_process(exported):
     _, controller, folder = exported("LFM", "float64")
     c_runner(folder / "nfriction.c", ("-O3", "-ffast-math"))(*points(controller, "float64", 5))
     tiny = np.full(3, 1e-310)
@@ -199,7 +199,7 @@ def test_running_fast_math_leaves_this_process_alone(exported):
 
 
 @cases
-def test_torque_that_overflows_is_not_finite(exported, dtype):
+def test_overflowing_torque_is_reported_as_not_finite(exported, dtype):
     _, _, folder = exported("LFM", dtype)
     huge = 1e38 if dtype == "float32" else 1e308
     x = np.full((1, 3), huge)
@@ -208,7 +208,7 @@ def test_torque_that_overflows_is_not_finite(exported, dtype):
     assert stays.all()
 
 
-def test_status_tells_clamping_and_saturation(exported):
+def test_status_reports_clamping_and_saturation(exported):
     _, controller, folder = exported("NFLFM", "float64", torque_limit=0.05)
     inputs = draw(controller, 2000, seed=1)
     tau, _, status = c_runner(folder / "nfriction.c")(*inputs)
@@ -230,12 +230,12 @@ def test_the_filter_runs_inside(exported, name, dtype):
     if dtype == "float64":
         inputs = draw(controller, 300)
         found = c_runner(folder / "nfriction.c")(*inputs)
-        # Differences over a millisecond, taken twice, raise rounding a thousandfold each.
+        # Two differences over a millisecond each amplify round-off a thousandfold.
         parity = compare(controller.run(*inputs), found, 1e-10)
         assert parity.passed, parity
 
 
-def test_the_same_model_gives_the_same_bytes(exported, tmp_path):
+def test_export_is_deterministic(exported, tmp_path):
     for name in ("NFNLFM", "ANLFM"):
         _, _, folder = exported(name, "float32")
         for path in c(random_model(name), tmp_path / name, INFO, dtype="float32"):
@@ -263,7 +263,8 @@ def test_hostile_names_do_not_become_code(tmp_path):
 
 
 def test_two_controllers_live_in_one_program(tmp_path):
-    """Each as alone, with memory and filter, in one folder and by either header."""
+    """Each equals its separate build, with memory and filter, in one folder and with either
+    header."""
     names = ("ALFM", "NFLFM", "NLFM")
     for name in names:
         c(random_model(name), tmp_path, INFO, name=name.lower(), with_filter=name == "ALFM")
@@ -284,10 +285,12 @@ def test_two_controllers_live_in_one_program(tmp_path):
             build([*C89, "-c", f"{name.lower()}.c"], tmp_path)
         objects = [f"{name.lower()}.o" for name in names]
         build([*command, main.name, *objects, "-o", "all", "-lm"], tmp_path)
-        said = subprocess.run([tmp_path / "all"], capture_output=True, text=True, check=True).stdout
+        output = subprocess.run(
+            [tmp_path / "all"], capture_output=True, text=True, check=True
+        ).stdout
         one = torch.ones(3, dtype=torch.float64)
         expected = [random_model(name)(one, one, one)[2].item() for name in names]
-        np.testing.assert_allclose([float(x) for x in said.split()], expected, rtol=1e-13)
+        np.testing.assert_allclose([float(x) for x in output.split()], expected, rtol=1e-13)
 
 
 def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
@@ -298,8 +301,8 @@ def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
 
 
 @pytest.mark.parametrize("with_filter", [False, True])
-def test_the_sketch_starts_at_rest_wherever_the_joints_are(tmp_path, with_filter):
-    """Positions of half a turn, not of zero, before the first call."""
+def test_sketch_starts_at_rest_from_any_position(tmp_path, with_filter):
+    """Positions before the first call are half a turn, not zero."""
     c(random_model("LFM"), tmp_path, INFO, with_filter=with_filter)
     (tmp_path / "main.cpp").write_text(
         '#include "nfriction.ino"\n#include <cstdio>\n'
@@ -310,8 +313,10 @@ def test_the_sketch_starts_at_rest_wherever_the_joints_are(tmp_path, with_filter
     )
     build(["gcc", "-c", "nfriction.c"], tmp_path)
     build([*CXX, f"-I{STUBS}", "main.cpp", "nfriction.o", "-o", "sketch"], tmp_path)
-    said = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["128"] * 6
+    output = subprocess.run(
+        [tmp_path / "sketch"], capture_output=True, text=True, check=True
+    ).stdout
+    assert output.split() == ["128"] * 6
 
 
 @pytest.mark.parametrize(("law", "period"), [("LFM", "INHERITED_SAMPLE_TIME"), ("LuGre", "0.004")])
@@ -342,7 +347,7 @@ def test_skeletons_and_wrapper_compile(exported, name, dtype, with_filter):
     )
 
 
-def test_simulink_and_cpp_give_the_torque_of_the_c(exported):
+def test_simulink_and_cpp_give_the_same_torque_as_c(exported):
     _, _, folder = exported("ALFM", "float64")
     (folder / "main.cpp").write_text(
         '#include <cstdio>\n#include "nfriction.hpp"\n#include "simstruc.h"\n'
@@ -378,7 +383,7 @@ DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"), Coefficient("E", "N m")),
 
 
 class Sums(Constant):
-    """A schedule of one's own that couples the joints, so that no two are alike."""
+    """A user-defined schedule that couples the joints, so that no two are equal."""
 
     def forward(self, qd, qdd):
         spread = torch.cos(torch.cumsum(qd, -1)).unsqueeze(-1)
@@ -387,7 +392,7 @@ class Sums(Constant):
 
 @cases
 @pytest.mark.parametrize("schedule", [Constant, Sums])
-def test_a_law_and_schedule_of_ones_own_export(tmp_path, schedule, dtype):
+def test_user_defined_law_and_schedule_are_exported(tmp_path, schedule, dtype):
     model = FrictionModel(DRAG, schedule(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
     c(model, tmp_path, INFO, dtype=dtype)
     controller = controller_of(model, INFO)
@@ -398,7 +403,7 @@ def test_a_law_and_schedule_of_ones_own_export(tmp_path, schedule, dtype):
 
 
 class Fading(Constant):
-    """A memory of past motion, of which more than the last sample counts."""
+    """A hidden state of the past motion that depends on more than the last sample."""
 
     state_size = 2
 
@@ -419,8 +424,8 @@ class Fading(Constant):
 
 @cases
 @pytest.mark.parametrize("flags", [("-O3",), ("-O3", "-ffast-math")])
-def test_a_schedule_of_ones_own_with_a_memory_exports(tmp_path, dtype, flags):
-    """Where the load alone is not finite, the memory goes on."""
+def test_user_defined_schedule_with_memory_is_exported(tmp_path, dtype, flags):
+    """If only the load is not finite, the hidden state still advances."""
     model = FrictionModel(DRAG, Fading(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
     c(model, tmp_path, INFO, dtype=dtype)
     build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
@@ -436,8 +441,8 @@ def test_a_schedule_of_ones_own_with_a_memory_exports(tmp_path, dtype, flags):
 
 @cases
 @pytest.mark.parametrize("schedule", [Rising, Fading])
-def test_a_schedule_that_has_no_range_is_clamped_in_c_too(tmp_path, schedule, dtype):
-    """Under a name that begins as those in the templates do."""
+def test_schedule_without_a_range_is_clamped_in_c_too(tmp_path, schedule, dtype):
+    """Also with a name that begins like those in the templates."""
 
     class Unbounded(schedule):
         handles_range = False
@@ -455,7 +460,7 @@ def test_a_schedule_that_has_no_range_is_clamped_in_c_too(tmp_path, schedule, dt
 
 
 @pytest.mark.parametrize("terms", [(3, 5), (6, 2)])
-def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
+def test_inputs_may_differ_in_their_number_of_sets(tmp_path, terms):
     model = model_by_name("NFLFM")(2, INITIAL["linear"], terms=terms)
     randomise(model, 0.2)
     c(model, tmp_path)
@@ -465,7 +470,7 @@ def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
     assert parity.passed, parity
 
 
-def test_sets_so_narrow_that_all_underflow_export(tmp_path):
+def test_sets_so_narrow_that_all_underflow_are_exported(tmp_path):
     model = random_model("NFLFM")
     with torch.no_grad():
         model.schedule.network.anfis.partition.log_widths.sub_(2.7)
@@ -474,7 +479,7 @@ def test_sets_so_narrow_that_all_underflow_export(tmp_path):
 
 
 def test_a_law_may_differ_by_joint(tmp_path):
-    """A law that reads a number of its own for every joint is written out for all of them."""
+    """A law with separate constants for each joint is written out for all joints."""
     factors = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
 
     def own(qd, load, coefficients, v_smooth):
@@ -519,7 +524,7 @@ PLACES = ["-Wl,--section-start=.vectors=0", "-Wl,-Ttext=0x10000", "-Wl,-Tdata=0x
     reason="needs arm-none-eabi-gcc with newlib, and qemu-system-arm",
 )
 @pytest.mark.parametrize(("name", "flags"), [("NFLFM", ("-Os",)), ("ALFM", ("-O3", "-ffast-math"))])
-def test_passes_on_a_cortex_m4(exported, name, flags):
+def test_self_test_passes_on_a_cortex_m4(exported, name, flags):
     _, _, folder = exported(name, "float32")
     (folder / "start.c").write_text(START)
     build(["arm-none-eabi-gcc", *flags, *ARM, "--specs=rdimon.specs", *PLACES, "start.c",
@@ -534,7 +539,7 @@ def test_passes_on_a_cortex_m4(exported, name, flags):
 
 
 @pytest.mark.skipif(not shutil.which("arm-none-eabi-gcc"), reason="needs arm-none-eabi-gcc")
-def test_a_joint_fits_a_small_flash(tmp_path):
+def test_one_joint_fits_a_small_flash(tmp_path):
     info = ModelInfo(input_ranges={"qd": [[-8.0, 7.1]], "qdd": [[-60.0, 50.1]]})
     c(random_model("NFLFM", joints=1), tmp_path, info, dtype="float32")
     build(["arm-none-eabi-gcc", "-std=c89", "-Os", *ARM, "-c", "nfriction.c", "-o", "m4.o"],
@@ -553,7 +558,7 @@ def test_a_joint_fits_a_small_flash(tmp_path):
 )
 @cases
 @pytest.mark.parametrize(("name", "flags"), [("NFLFM", ("-O1",)), ("ALFM", ("-O3", "-ffast-math"))])
-def test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
+def test_self_test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
     _, _, folder = exported(name, dtype)
     build(["powerpc-linux-gnu-gcc", *flags, "-static", "nfriction_selftest.c", "nfriction.c",
            "-o", "ppc", "-lm"], folder)  # fmt: skip
@@ -569,7 +574,7 @@ def test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
     [rigs.multiarm_triple(), rigs.tlrip("free"), Rotor(0.02)],
     ids=["chain", "arm", "rotor"],
 )
-def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_path):
+def test_load_function_of_the_export_equals_that_of_the_plant(plant, dtype, tmp_path):
     joints = plant.joints
     info = ModelInfo(rig=plant.to_dict(), joint_names=plant.joint_names)
     model = random_model("LFM", joints)
@@ -590,8 +595,8 @@ def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_pat
     )
     build([*C89, "-c", "nfriction.c"], tmp_path)
     build([*CXX, "-Wno-missing-braces", "main.cpp", "nfriction.o", "-o", "load"], tmp_path)
-    said = subprocess.run([tmp_path / "load"], capture_output=True, text=True, check=True).stdout
-    found = np.array([float(x) for x in said.split()]).reshape(-1, joints)
+    output = subprocess.run([tmp_path / "load"], capture_output=True, text=True, check=True).stdout
+    found = np.array([float(x) for x in output.split()]).reshape(-1, joints)
     tolerance = 1e-14 if dtype == "float64" else 2e-6
     expected = plant.load(q, qd).numpy()
     np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
@@ -602,7 +607,7 @@ def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_pat
     assert "HAS_LOAD 0" in (tmp_path / "even" / "nfriction.h").read_text()
 
 
-def test_texts_name_continuous_positions_and_those_of_an_axis(tmp_path):
+def test_comments_name_continuous_and_linear_positions(tmp_path):
     texts = {}
     for unit, plant in (("rad", rigs.multiarm_double()), ("m", LinearAxis(2.0))):
         info = ModelInfo(unit=unit, rig=plant.to_dict(), sample_time=1e-3)
@@ -614,7 +619,7 @@ def test_texts_name_continuous_positions_and_those_of_an_axis(tmp_path):
     assert not any(word in text for text in texts["m"] for word in ("angle", "upright"))
 
 
-def test_the_header_has_the_constant_torques_that_a_fit_gave_to_the_drives(tmp_path):
+def test_header_contains_the_fitted_torque_offsets_of_the_drives(tmp_path):
     plant = rigs.multiarm_double()
     offset = torch.tensor([0.0, -0.015], dtype=torch.float64)
     for name, rig in (("with", plant.replace(torque_offset=offset)), ("without", plant)):

@@ -12,8 +12,8 @@ from nfriction.export.c_dialect import ControllerC
 from nfriction.export.c_model import exponential
 
 GCC = shutil.which("gcc")
-# Arguments that it takes. Below -87.3 the result is 0; further down k would not fit its integer,
-# and above zero it would be rounded to the wrong side, which a rounding may come to.
+# Range of arguments. Below -87.3 the result is 0, and further down k would overflow its integer;
+# above zero, which rounding can cause, it would be rounded in the wrong direction.
 LEAST, LARGEST = -1e9, 0.1
 TANH = 64
 
@@ -35,7 +35,7 @@ def library(request, tmp_path_factory):
             )
         texts.append(f"void tanh_{real}({real} *x, int n) {{ (void)n; {real}_tanh(x); }}")
     (folder / "e.c").write_text("\n".join(texts))
-    # Linked apart: with -ffast-math that would take subnormal numbers from this very process.
+    # Linked separately: with -ffast-math it would disable subnormal numbers in this process.
     for command in (["-std=c99", *request.param.split(), "-fPIC", "-c", "e.c"],
                     ["-shared", "e.o", "-o", "e.so"]):  # fmt: skip
         subprocess.run([GCC, *command], cwd=folder, check=True, capture_output=True)
@@ -51,39 +51,40 @@ def run(library, real: str, x: np.ndarray, name: str = "run") -> np.ndarray:
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_it_is_accurate_to_one_and_a_half_units_in_the_last_place(library, real):
+def test_exp_is_accurate_to_one_and_a_half_ulp(library, real):
     kind = np.float64 if real == "double" else np.float32
     random = np.random.default_rng(0)
     x = np.concatenate([-(10.0 ** random.uniform(-20, 1.9, 100_001)), [0.0, LARGEST]]).astype(kind)
     exact = np.exp(x.astype(np.longdouble))
-    # -ffast-math may join both parts of ln 2: half a unit of it k times, k = |x| / ln 2.
+    # -ffast-math may merge both parts of ln 2: an error of half an ulp of it k times, k = |x| / ln
+    # 2.
     allowed = 1.5 + 0.75 * np.abs(x.astype(np.float64)) * library.joins_terms
     error = np.abs(run(library, real, x) - exact) / np.spacing(exact.astype(kind))
     assert (error <= allowed).all()
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_less_one_small_numbers_keep_their_digits(library, real):
+def test_expm1_is_accurate_for_small_arguments(library, real):
     kind = np.float64 if real == "double" else np.float32
     random = np.random.default_rng(0)
     x = np.concatenate([-(10.0 ** random.uniform(-20, 1.6, 100_001)), [0.0]]).astype(kind)
     exact = np.expm1(x.astype(np.longdouble))
     error = np.abs(run(library, real, x, "less") - exact)
-    # -ffast-math may join both parts of ln 2, which moves the argument by |x| / ln 2 half units.
+    # -ffast-math may merge both parts of ln 2, which shifts the argument by |x| / ln 2 half ulps.
     joined = 0.75 * np.abs(x.astype(np.float64)) * np.exp(x) * library.joins_terms
     allowed = 2.5 * np.spacing(np.abs(exact).astype(kind)) + joined * np.spacing(kind(1.0))
     assert (error <= allowed).all()
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_it_vanishes_far_below_and_keeps_nan(library, real):
+def test_exp_underflows_to_zero_and_keeps_nan(library, real):
     x = np.array([-88.1, -1e3, -1e6, LEAST])
     assert (run(library, real, x) == 0.0).all()
     assert np.isnan(run(library, real, np.array([math.nan] * 5))).all()
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_tanh_is_accurate_at_every_size(library, real):
+def test_tanh_is_accurate_at_every_magnitude(library, real):
     random = np.random.default_rng(1)
     x = np.concatenate([10.0 ** random.uniform(-20, 3, TANH - 4), [0.0, 20.0, 1e6, 1e-300]])
     x = (x * random.choice([-1.0, 1.0], TANH)).astype(
@@ -91,5 +92,5 @@ def test_tanh_is_accurate_at_every_size(library, real):
     )
     found = run(library, real, x, "tanh")
     exact = np.tanh(x.astype(np.longdouble))
-    # Relative to the result: around zero nothing cancels.
+    # Relative to the result: there is no cancellation around zero.
     assert (np.abs(found - exact) <= 6 * np.spacing(np.abs(exact).astype(x.dtype))).all()

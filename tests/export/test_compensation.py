@@ -1,4 +1,4 @@
-"""The worked example of friction compensation: it builds, and shows what its guide says."""
+"""The worked example of friction compensation builds and reproduces its guide's numbers."""
 
 import re
 import shutil
@@ -24,7 +24,7 @@ def rows(text: str) -> Rows:
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Rows:
-    """Error, motion at rest and chatter by velocity and gain."""
+    """Error, motion at rest and chatter by velocity signal and gain."""
     folder = tmp_path_factory.mktemp("compensation")
     export.c(CVFM(1, [0.35, 0.12]), folder, name="friction")
     shutil.copy(ROOT / "examples" / "compensation" / "main.cpp", folder)
@@ -37,13 +37,13 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     return rows(run.stdout)
 
 
-def test_compensation_cuts_the_error(shown: Rows) -> None:
+def test_compensation_reduces_the_error(shown: Rows) -> None:
     without = shown["none", "0.0"][0]
     for velocity in ("measured", "desired"):
         assert shown[velocity, "0.8"][0] < 0.2 * without
 
 
-def test_too_much_of_the_measured_velocity_keeps_moving_at_rest(shown: Rows) -> None:
+def test_high_gain_on_measured_velocity_causes_motion_at_rest(shown: Rows) -> None:
     assert shown["measured", "1.3"][1] > 20 * shown["measured", "0.8"][1]
     assert shown["measured", "1.3"][1] > 20 * shown["measured, faded below 0.05 rad/s", "1.3"][1]
     assert shown["measured", "1.3"][1] > 20 * shown["desired", "1.3"][1]

@@ -1,4 +1,4 @@
-"""What an artefact carries: vectors that cover the edges, JSON that survives, and hostile ones."""
+"""Contents of an artefact: test vectors that cover the edges, lossless JSON, hostile metadata."""
 
 import json
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def contract(name: str = "LFM", with_filter: bool = False, **options: Any) -> Co
 
 @pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
 @pytest.mark.parametrize("with_filter", [False, True])
-def test_vectors_cover_the_range_what_lies_beyond_and_what_is_broken(
+def test_vectors_cover_the_range_its_outside_and_broken_inputs(
     name: str, with_filter: bool
 ) -> None:
     found = contract(name, with_filter)
@@ -59,11 +59,11 @@ def test_vectors_cover_the_range_what_lies_beyond_and_what_is_broken(
 
 
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
-def test_json_gives_the_same_back_and_the_same_model_the_same_bytes(name: str) -> None:
+def test_json_is_lossless_and_deterministic(name: str) -> None:
     found = contract(name)
     text = found.to_json()
     assert text == contract(name).to_json()
-    json.loads(text, parse_constant=pytest.fail)  # a bare NaN is no JSON; some readers refuse it
+    json.loads(text, parse_constant=pytest.fail)  # a bare NaN is not JSON; some readers refuse it
     back = Contract.from_json(text)
     assert back.to_json() == text
     for side in ("inputs", "outputs"):
@@ -73,16 +73,16 @@ def test_json_gives_the_same_back_and_the_same_model_the_same_bytes(name: str) -
             )
 
 
-def test_it_says_what_a_host_needs() -> None:
+def test_json_contains_what_a_host_needs() -> None:
     info = ModelInfo(joint_names=["a", "b", "c"], sample_time=2e-3, training_data={"run": "ab12"})
     controller = controller_of(MODELS["LFM"], info, torque_limit=2.0)
-    told = json.loads(contract_of(MODELS["LFM"], controller, info).to_json())
-    assert told["joint_names"] == ["a", "b", "c"]
-    assert told["units"]["tau_f"] == "N m"
-    assert told["sample_time"] == 2e-3
-    assert told["training_data"] == {"run": "ab12"}
-    assert told["torque_limit"] == [2.0, 2.0, 2.0]
-    assert told["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
+    contract = json.loads(contract_of(MODELS["LFM"], controller, info).to_json())
+    assert contract["joint_names"] == ["a", "b", "c"]
+    assert contract["units"]["tau_f"] == "N m"
+    assert contract["sample_time"] == 2e-3
+    assert contract["training_data"] == {"run": "ab12"}
+    assert contract["torque_limit"] == [2.0, 2.0, 2.0]
+    assert contract["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
     assert {
         "version",
         "schema",
@@ -91,7 +91,7 @@ def test_it_says_what_a_host_needs() -> None:
         "edges",
         "tolerance",
         "scales",
-    } <= told.keys()
+    } <= contract.keys()
 
 
 def broken_torque(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
@@ -140,7 +140,7 @@ def test_errors_are_relative_to_each_joints_own_scale() -> None:
 
 
 @pytest.mark.parametrize("name", list(MODELS))
-def test_scales_are_the_largest_values_and_more_where_roundings_cost_it(name: str) -> None:
+def test_scales_are_largest_values_or_larger_for_round_off(name: str) -> None:
     for dtype, tolerance in (("float64", 1e-12), ("float32", 5e-7)):
         found = contract(name, dtype=dtype)
         assert found.tolerance == tolerance
@@ -150,7 +150,7 @@ def test_scales_are_the_largest_values_and_more_where_roundings_cost_it(name: st
             assert (scale <= 20.0 * largest).all()
 
 
-def test_a_model_that_computes_in_double_alone_is_judged_by_its_values() -> None:
+def test_double_only_model_is_judged_by_its_values() -> None:
     class Double(Rising):
         def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
             return super().forward(qd, qdd) @ torch.eye(2, dtype=torch.float64)
@@ -161,7 +161,7 @@ def test_a_model_that_computes_in_double_alone_is_judged_by_its_values() -> None
     assert torch.equal(found.scales["tau_f"], largest)
 
 
-def test_the_type_is_one_of_two() -> None:
+def test_dtype_is_float32_or_float64() -> None:
     with pytest.raises(ValueError, match="float32"):
         contract("LFM", dtype="float16")
 
@@ -229,7 +229,7 @@ def test_names_and_rig_must_have_the_models_joints(
 ) -> None:
     model, motion = LFM(2), Motion(*(np.ones((4, 2)) for _ in range(4)))
     for write in (
-        lambda: export.c(model, tmp_path, info),  # whose load of the rig would leave its array
+        lambda: export.c(model, tmp_path, info),  # its load function would read beyond its array
         lambda: export.torchscript(model, tmp_path / "m.pt", info),
         lambda: export.pt2(model, tmp_path / "m.pt2", info),
         lambda: export.fit_damping_frictionloss(model, motion, info=info),

@@ -1,4 +1,4 @@
-"""The contract: the model in range, its edge beyond, NaN for what is broken, limits, states."""
+"""The contract: model within range, its edge outside, NaN for broken inputs, limits, states."""
 
 import math
 from typing import Any
@@ -21,7 +21,7 @@ ADAPTIVE = [name for name in MODELS if name not in STATELESS]
 
 
 @pytest.mark.parametrize("name", STATELESS)
-def test_for_finite_inputs_it_is_the_model_in_range_and_beyond(name: str) -> None:
+def test_controller_equals_the_model_at_clamped_inputs(name: str) -> None:
     model = MODELS[name]
     qd, qdd, load = motion(500, 3)
     tau_f, coefficients, status = controller_of(model, INFO)(qd, qdd, load)
@@ -36,7 +36,7 @@ def test_for_finite_inputs_it_is_the_model_in_range_and_beyond(name: str) -> Non
     assert torch.equal(status == 0, ~outside)
 
 
-def test_a_schedule_without_a_range_is_clamped_and_the_law_goes_on() -> None:
+def test_only_schedule_inputs_are_clamped_not_those_of_the_law() -> None:
     model = rising()
     controller = controller_of(model, INFO)
     qd, qdd, load = motion(500, 3, seed=2)
@@ -46,7 +46,7 @@ def test_a_schedule_without_a_range_is_clamped_and_the_law_goes_on() -> None:
     torch.testing.assert_close(coefficients, edge)
     torch.testing.assert_close(tau_f, model.torque(3 * qd, load, edge))
     assert (status == OUTSIDE).any()
-    # Without ranges there is nothing to clamp to.
+    # Without ranges nothing is clamped.
     free, _, status = controller_of(model)(3 * qd, 3 * qdd, load)
     torch.testing.assert_close(free, model(3 * qd, 3 * qdd, load))
     assert not status.any()
@@ -55,7 +55,7 @@ def test_a_schedule_without_a_range_is_clamped_and_the_law_goes_on() -> None:
 @pytest.mark.parametrize("name", STATELESS)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("which", range(3))
-def test_what_is_not_finite_spoils_its_joint_alone(name: str, bad: float, which: int) -> None:
+def test_non_finite_inputs_affect_only_their_joint(name: str, bad: float, which: int) -> None:
     inputs = motion(4, 3)
     controller = controller_of(MODELS[name], INFO, torque_limit=100.0)
     sound = controller(*inputs)
@@ -72,7 +72,7 @@ def test_what_is_not_finite_spoils_its_joint_alone(name: str, bad: float, which:
     torch.testing.assert_close(torque, tau_f, equal_nan=True)
 
 
-def test_a_torque_that_overflows_is_not_given_out() -> None:
+def test_overflowing_torque_is_not_returned() -> None:
     model = LFM(1, [1.0, 1.0])
     huge = torch.full((1,), 1e308, dtype=torch.float64)
     tau_f, _, status = controller_of(model)(10 * huge / 10, 0 * huge, huge)
@@ -80,7 +80,7 @@ def test_a_torque_that_overflows_is_not_given_out() -> None:
     assert status == NOT_FINITE
 
 
-def test_the_torque_saturates_and_says_so() -> None:
+def test_torque_saturates_and_sets_the_status_bit() -> None:
     model = MODELS["NFLFM"]
     inputs = motion(500, 3)
     free = model(*inputs)
@@ -100,7 +100,7 @@ def test_any_batch_shape() -> None:
 
 
 @pytest.mark.parametrize("name", ADAPTIVE)
-def test_a_memory_goes_along_and_survives_nan(name: str) -> None:
+def test_hidden_state_advances_and_survives_nan(name: str) -> None:
     model = MODELS[name]
     schedule = model.schedule
     controller = controller_of(model)
@@ -121,7 +121,7 @@ def test_a_memory_goes_along_and_survives_nan(name: str) -> None:
         torch.testing.assert_close(after[1], state[1])
 
 
-def test_the_filter_is_that_of_signals_on_differences() -> None:
+def test_filter_equals_that_of_signals_on_differences() -> None:
     model = MODELS["NFLFM"]
     controller = controller_of(model, INFO, with_filter=True, cutoff_hz=30.0)
     assert controller.inputs == ("q", "load")
@@ -146,7 +146,7 @@ def test_the_filter_is_that_of_signals_on_differences() -> None:
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
 @pytest.mark.parametrize("lost", [1, 100])
 def test_the_filter_survives_lost_samples(name: str, lost: int) -> None:
-    """At a constant velocity, where the velocity after the gap is that before it."""
+    """At a constant velocity, which is the same before and after the gap."""
     controller = controller_of(MODELS[name], INFO, with_filter=True)
     assert controller.inputs == ("q", "load")
     qd = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
@@ -154,21 +154,21 @@ def test_the_filter_survives_lost_samples(name: str, lost: int) -> None:
     q[400 : 400 + lost, 0] = math.inf
     q[0, 1] = math.nan  # an encoder that is not ready yet
     tau_f, _, status = controller.run(q, torch.ones_like(q))
-    # A velocity needs two positions in a row.
+    # A velocity needs two successive positions.
     bad = torch.zeros_like(status, dtype=torch.bool)
     bad[400 : 401 + lost, 0] = bad[:2, 1] = True
     assert torch.equal(status == NOT_FINITE, bad)
     assert torch.equal(torch.isnan(tau_f), bad)
     settled = tau_f[399]
     torch.testing.assert_close(tau_f[401 + lost :], settled.expand(599 - lost - 400, 3))
-    # A load that is lost does not stop the filter.
+    # A lost load does not stop the filter.
     state = controller.start(q[300], settled)
     *_, after = controller(q[301], settled * math.nan, state)
     *_, sound = controller(q[301], settled, state)
     torch.testing.assert_close(after, sound)
 
 
-def test_the_model_stays_as_it_was_and_is_not_shared() -> None:
+def test_model_is_copied_and_not_modified() -> None:
     model = NFLFM(2).to(torch.float32).train()
     controller = controller_of(model)
     assert model.training
@@ -212,14 +212,14 @@ def test_malformed_sample_times_and_cutoffs_are_refused(step: Any) -> None:
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
 @pytest.mark.parametrize("with_filter", [False, True])
-def test_no_samples_give_no_torques(name: str, with_filter: bool) -> None:
+def test_empty_batch_gives_no_torques(name: str, with_filter: bool) -> None:
     controller = controller_of(MODELS[name], INFO, with_filter=with_filter)
     none = torch.zeros(0, 3, dtype=torch.float64)
     found = controller.run(*[none] * len(controller.inputs))
     assert [len(x) for x in found] == [0, 0, 0]
 
 
-def test_a_filter_needs_the_sample_time_and_inputs_their_joints() -> None:
+def test_missing_sample_time_and_wrong_joint_counts_are_refused() -> None:
     with pytest.raises(ValueError, match="sample_time"):
         controller_of(LFM(2), with_filter=True)
     with pytest.raises(ValueError, match="with 2 joints, got last axis 3"):

@@ -1,4 +1,4 @@
-"""Programs in files of strangers are never run: torch runs our own with their numbers, or none."""
+"""Untrusted programs are never run: torch runs our own program with the file's numbers, or none."""
 
 import json
 import warnings
@@ -23,7 +23,7 @@ KINDS = {".pt": torchscript, ".pt2": pt2}
 
 @pytest.fixture(scope="module")
 def artefacts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A sound artefact of each kind."""
+    """A valid artefact of each kind."""
     folder = tmp_path_factory.mktemp("artefacts")
     return {kind: write(MODEL, folder / f"model{kind}", INFO) for kind, write in KINDS.items()}
 
@@ -49,14 +49,14 @@ def changed(value: Any, key: str, to: Any) -> Any:
 
 
 def refuse(path: Path, sound: Path) -> None:
-    """The file is refused with the reason, before torch is given anything of it."""
+    """Assert that the file is refused with the reason, before torch reads anything of it."""
     contract_of_archive(path)
     with pytest.raises(ExportError, match=rf"{path.name}: its program is not the one"):
         own_program(path, sound.read_bytes())
 
 
 def refuse_to_run(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Verification refuses the file without a trace of having run it."""
+    """Assert that verification refuses the file without having run any of it."""
     monkeypatch.chdir(path.parent)
     with pytest.raises(ExportError, match=rf"{path.name}: its program is not the one"):
         verify_artefact(path, MODEL, INFO, points=50)
@@ -64,7 +64,7 @@ def refuse_to_run(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_sound_artefact_passes_and_other_numbers_are_found_out(
+def test_valid_artefact_passes_and_changed_numbers_are_detected(
     kind: str, artefacts: dict[str, Path], tmp_path: Path
 ) -> None:
     assert verify_artefact(artefacts[kind], MODEL, INFO, points=50).passed
@@ -97,8 +97,8 @@ def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None
         verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 
 
-def test_programs_are_the_same_whatever_was_exported_before(tmp_path: Path) -> None:
-    """torch numbers the classes that it scripts, and the file has their names."""
+def test_programs_do_not_depend_on_earlier_exports(tmp_path: Path) -> None:
+    """torch numbers the classes that it scripts, and their names are in the file."""
     first, second = (torchscript(MODEL, tmp_path / f"{k}.pt", INFO) for k in "ab")
     assert files_of(first).keys() != files_of(second).keys()
     for path in (first, second):
@@ -143,7 +143,7 @@ def test_files_that_are_not_ours_are_refused(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_no_artefact_is_refused(
+def test_files_that_are_no_artefacts_are_refused(
     kind: str, artefacts: dict[str, Path], tmp_path: Path
 ) -> None:
     bad = tmp_path / f"bad{kind}"
@@ -162,11 +162,11 @@ def test_what_is_no_artefact_is_refused(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_artefacts_say_nothing_of_the_machine_that_wrote_them(
+def test_artefacts_do_not_reveal_the_machine_that_wrote_them(
     kind: str, artefacts: dict[str, Path]
 ) -> None:
-    told = b"".join(x for n, x in files_of(artefacts[kind]).items() if "debug_pkl" not in n)
-    assert str(Path(__file__).parents[2]).encode() not in told
+    content = b"".join(x for n, x in files_of(artefacts[kind]).items() if "debug_pkl" not in n)
+    assert str(Path(__file__).parents[2]).encode() not in content
 
 
 class Saving(nn.Module):
@@ -180,7 +180,7 @@ class Saving(nn.Module):
 
 
 class Waking(Saving):
-    """Runs as it is loaded."""
+    """A program that runs while it is loaded."""
 
     @torch.jit.export
     def __getstate__(self) -> int:
@@ -192,7 +192,7 @@ class Waking(Saving):
 
 
 @pytest.mark.parametrize("kind", [Saving, Waking])
-def test_a_script_that_does_more_than_arithmetic_is_refused(
+def test_script_with_more_than_arithmetic_is_refused(
     kind: type[nn.Module],
     artefacts: dict[str, Path],
     tmp_path: Path,
@@ -206,7 +206,7 @@ def test_a_script_that_does_more_than_arithmetic_is_refused(
     refuse_to_run(path, monkeypatch)
 
 
-def test_a_script_that_runs_as_it_is_loaded_is_refused(
+def test_script_that_runs_while_it_is_loaded_is_refused(
     artefacts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     evil = b'load: Tensor, x: Tensor=torch.from_file("attacked", True, 8))'

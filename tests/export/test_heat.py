@@ -28,7 +28,7 @@ def along(qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-def test_c_heats_as_the_model_does_and_starts_cold_after_a_reset(tmp_path: Path) -> None:
+def test_heat_in_c_equals_the_models_and_is_zero_after_a_reset(tmp_path: Path) -> None:
     given = motion(400, 2)
     torque, heat = along(*given)
     run = c_runner(export.c(MODEL, tmp_path, INFO)[0])
@@ -41,10 +41,10 @@ def test_c_heats_as_the_model_does_and_starts_cold_after_a_reset(tmp_path: Path)
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-def test_c_in_single_precision_loses_no_small_step_of_the_heat(tmp_path: Path) -> None:
+def test_c_in_single_precision_keeps_small_heat_increments(tmp_path: Path) -> None:
     model = copy.deepcopy(MODEL)
     model.schedule.set_heat(3.0, 1e6, 2e-3)
-    # A hot joint that then creeps: a step of its heat is below half a digit of it in float.
+    # A hot joint that then creeps: one increment of its heat is below half an ulp in float.
     qd = np.full((200_000, 2), 2e-4)
     qd[:10] = 20.0
     heats = []
@@ -64,7 +64,7 @@ def test_onnx_in_single_precision_that_would_lose_heat_is_refused(tmp_path: Path
 
 
 @pytest.mark.parametrize(("info", "expected"), [(ModelInfo(sample_time=1e-3), 1e-3), (None, 2e-3)])
-def test_an_export_heats_by_the_sample_time_that_it_states(info, expected: float) -> None:
+def test_heat_is_integrated_with_the_stated_sample_time(info, expected: float) -> None:
     controller = controller_of(MODEL, info)
     assert controller.model.schedule.sample_time == pytest.approx(expected)
     description = contract_of(MODEL, controller, info).description
@@ -72,7 +72,7 @@ def test_an_export_heats_by_the_sample_time_that_it_states(info, expected: float
     assert MODEL.schedule.sample_time == pytest.approx(2e-3)
 
 
-def test_torchscript_heats_as_the_model_does(tmp_path: Path) -> None:
+def test_heat_in_torchscript_equals_the_models(tmp_path: Path) -> None:
     given = motion(200, 2)
     module = torch.jit.load(str(export.torchscript(MODEL, tmp_path / "model.pt", INFO)))
     state, found = module.initial_state(given[0][0], given[1][0]), []
@@ -84,7 +84,7 @@ def test_torchscript_heats_as_the_model_does(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["model.pt2", "model.onnx"])
-def test_other_files_heat_as_the_model_does(name: str, tmp_path: Path) -> None:
+def test_heat_in_other_formats_equals_the_models(name: str, tmp_path: Path) -> None:
     if name.endswith("onnx"):
         pytest.importorskip("onnx")
     write = export.onnx if name.endswith("onnx") else export.pt2

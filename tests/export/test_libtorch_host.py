@@ -1,4 +1,4 @@
-"""The C++ example: builds against the wheel's LibTorch, proves artefacts, finds doctored ones."""
+"""The C++ example builds with the wheel's LibTorch, verifies artefacts, rejects altered ones."""
 
 import shutil
 import subprocess
@@ -39,7 +39,9 @@ def run(host: Path, path: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("name", ["LFM", "Stribeck", "ALFM", "NFNLFM"])
 @pytest.mark.parametrize("with_filter", [False, True])
-def test_it_proves_an_artefact(host: Path, name: str, with_filter: bool, tmp_path: Path) -> None:
+def test_host_verifies_an_artefact(
+    host: Path, name: str, with_filter: bool, tmp_path: Path
+) -> None:
     path = torchscript(named_models()[name], tmp_path / "m.pt", INFO, with_filter=with_filter)
     found = run(host, path)
     assert found.returncode == 0, found.stdout + found.stderr
@@ -47,7 +49,7 @@ def test_it_proves_an_artefact(host: Path, name: str, with_filter: bool, tmp_pat
     assert "p99" in found.stdout
 
 
-def test_it_finds_what_is_wrong(host: Path, tmp_path: Path) -> None:
+def test_host_detects_altered_artefacts(host: Path, tmp_path: Path) -> None:
     good = torchscript(named_models()["LFM"], tmp_path / "good.pt", INFO)
     bad = tmp_path / "bad.pt"
     with zipfile.ZipFile(good) as archive, zipfile.ZipFile(bad, "w") as other:

@@ -23,7 +23,7 @@ HYSTERESIS += [*[0.05] * ELEMENTS, *[10.0 ** (0.2 * k - 4) for k in range(ELEMEN
 
 
 def corrected(model: FrictionModel, size: float = 0.2) -> FrictionModel:
-    """A model whose network is anything that a fit may find."""
+    """A model with a randomised network, as general as any that a fit may find."""
     model.schedule.set_range(0.5, [-3.0, 3.0])
     lower, upper = model.schedule.bounds()
     noise = torch.randn(lower.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
@@ -53,13 +53,13 @@ def motion(count: int) -> Tensor:
 
 
 def loads(qd: Tensor) -> Tensor:
-    """Loads along a motion of either sign, as transmitted torques have, (sample, joint)."""
+    """Loads along a motion, with either sign as for transmitted torques, (sample, joint)."""
     t = torch.arange(len(qd), dtype=F64)[:, None] * STEP
     return 2.0 * torch.sin(torch.tensor([3.0, 5.0], dtype=F64) * t + 0.4)
 
 
 def torques(model: FrictionModel, qd: Tensor, load: Tensor | None = None) -> Tensor:
-    """Torques along a motion by the law's own two functions, by default under the `loads`."""
+    """Torques along a motion by the law's own two functions, by default with the `loads`."""
     law = model.law.memory
     assert law is not None
     state, load = torch.zeros(2, law.size, dtype=F64), loads(qd) if load is None else load
@@ -72,14 +72,14 @@ def torques(model: FrictionModel, qd: Tensor, load: Tensor | None = None) -> Ten
 
 @needs_compiler
 @every_model
-def test_c_gives_the_torques_of_the_law(name: str, tmp_path: Path) -> None:
+def test_c_equals_the_law(name: str, tmp_path: Path) -> None:
     qd = motion(3000)
     run = c_runner(export.c(MODELS[name], tmp_path, INFO)[0])
     tau, coefficients, status = run(qd.numpy(), np.zeros(qd.shape), loads(qd).numpy())
     expected = torques(MODELS[name], qd).numpy()
     assert np.abs(tau - expected).max() <= 1e-14 * np.abs(expected).max()
     assert not status.any()
-    # Behind the law's coefficients the state is given out.
+    # The state is returned after the law's coefficients.
     law = MODELS[name].law
     assert coefficients.shape[-1] == len(law.names) + law.state_size
     assert np.ptp(coefficients[:, 0, len(law.names)]) > 0
@@ -87,7 +87,7 @@ def test_c_gives_the_torques_of_the_law(name: str, tmp_path: Path) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize("name", ["lugre", "gear"])
-def test_c_begins_anew_after_a_reset_and_keeps_its_state_over_a_lost_sample(
+def test_c_restarts_after_a_reset_and_keeps_its_state_over_lost_samples(
     name: str, tmp_path: Path
 ) -> None:
     model, qd = MODELS[name], motion(400)
@@ -100,7 +100,7 @@ def test_c_begins_anew_after_a_reset_and_keeps_its_state_over_a_lost_sample(
     lost[201, 0] = math.inf
     rows = [*range(200), *range(202, 400)]
     if name == "gear":
-        # The state of this law cannot follow a load that nobody knows.
+        # The state of this law cannot follow an unknown load.
         unknown[202, 0] = math.nan
         rows.remove(202)
     tau, _, status = run(lost.numpy(), zero, unknown.numpy())
@@ -108,14 +108,14 @@ def test_c_begins_anew_after_a_reset_and_keeps_its_state_over_a_lost_sample(
     assert np.isnan(tau[bad, 0]).all()
     assert (status[bad, 0] == 2).all()
     assert np.array_equal(tau[:, 1], first[:, 1])
-    # The joint goes on from where it was, as if these samples had not been.
+    # The joint continues from its last state, as if these samples did not exist.
     expected = torques(model, qd[rows], load[rows])
     np.testing.assert_allclose(tau[rows, 0], expected[:, 0], rtol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gear.pt2", "gear.onnx"])
-def test_a_state_that_the_load_moves_is_in_all_files(name: str, tmp_path: Path) -> None:
+def test_load_dependent_state_is_in_all_formats(name: str, tmp_path: Path) -> None:
     if name.endswith("onnx"):
         pytest.importorskip("onnx")
     write = export.onnx if name.endswith("onnx") else export.pt2
@@ -126,7 +126,7 @@ def test_a_state_that_the_load_moves_is_in_all_files(name: str, tmp_path: Path) 
 
 
 @every_model
-def test_torchscript_steps_with_a_state(name: str, tmp_path: Path) -> None:
+def test_torchscript_is_stepped_with_a_state(name: str, tmp_path: Path) -> None:
     qd = motion(300)
     module = torch.jit.load(str(export.torchscript(MODELS[name], tmp_path / "model.pt", INFO)))
     rest, load = torch.zeros_like(qd), loads(qd)

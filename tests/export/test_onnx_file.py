@@ -1,4 +1,4 @@
-"""ONNX: equal to the model in double, as close as single precision allows, and refusals."""
+"""ONNX: equal to the model in double, close to it in single precision; refusals."""
 
 import importlib.util
 import sys
@@ -32,21 +32,21 @@ needs_onnx = pytest.mark.skipif(
 
 @needs_onnx
 @pytest.mark.parametrize("name", QUICK)
-def test_in_double_it_equals_the_model(name: str, tmp_path: Path) -> None:
+def test_model_and_double_export_agree(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.onnx", "float64", 5000)
 
 
 @needs_onnx
 @pytest.mark.parametrize("name", ["LFM", pytest.param("NFLFM", marks=pytest.mark.slow)])
-def test_in_single_precision_it_is_as_close_as_that_allows(name: str, tmp_path: Path) -> None:
+def test_model_and_single_export_agree_to_single_precision(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.onnx", "float32", 5000)
 
 
 @needs_onnx
-def test_edges_that_single_precision_does_not_know_are_those_of_the_model(tmp_path: Path) -> None:
-    """Both ways of rounding: none of the edges may count as outside, none beyond as inside."""
+def test_range_edges_are_exact_despite_single_precision(tmp_path: Path) -> None:
+    """With either rounding direction: no edge counts as outside, and nothing beyond as inside."""
     info = ModelInfo(input_ranges={"qd": [[-0.1, 0.7]] * 3, "qdd": [[-20.1, 1 / 3]] * 3})
-    # Compared with the model, edges included, as it is written.
+    # Compared with the model, including the edges, when it is written.
     assert onnx(MODELS["LFM"], tmp_path / "m.onnx", info, dtype="float32").is_file()
 
 
@@ -62,7 +62,7 @@ def test_parity_over_very_many_points(name: str, joints: int, dtype: str, tmp_pa
 @needs_onnx
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
-def test_the_filter_starts_by_itself(name: str, tmp_path: Path) -> None:
+def test_filter_initialises_itself(name: str, tmp_path: Path) -> None:
     assert onnx(MODELS[name], tmp_path / "m.onnx", INFO, with_filter=True).is_file()
 
 
@@ -82,7 +82,7 @@ def check_parity(
 
 
 @needs_onnx
-def test_a_schedule_of_ones_own_is_clamped_and_metadata_go_along(tmp_path: Path) -> None:
+def test_user_defined_schedule_is_clamped_and_metadata_are_stored(tmp_path: Path) -> None:
     package: Any = pytest.importorskip("onnx")
     check_parity(rising(), tmp_path / "m.onnx", "float64", 1000)
     file = package.load(tmp_path / "m.onnx")
@@ -91,12 +91,12 @@ def test_a_schedule_of_ones_own_is_clamped_and_metadata_go_along(tmp_path: Path)
     assert [x.name for x in file.graph.output] == ["tau_f", "coefficients", "status"]
     doubles = {package.TensorProto.DOUBLE, package.TensorProto.INT32, package.TensorProto.INT64,
                package.TensorProto.BOOL}  # fmt: skip
-    # Nothing in double has gone through single precision on its way.
+    # No double value was converted to single precision on the way.
     assert {x.data_type for x in file.graph.initializer} <= doubles
 
 
 @needs_onnx
-def test_without_onnx_runtime_the_packages_own_evaluator_serves(
+def test_without_onnx_runtime_the_reference_evaluator_is_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
@@ -122,7 +122,7 @@ def through_erf(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float)
 
 
 @needs_onnx
-def test_an_operation_without_a_form_is_named(tmp_path: Path) -> None:
+def test_operation_without_onnx_form_is_named(tmp_path: Path) -> None:
     law = Law("error function", (Coefficient("a", "N m"),), through_erf)
     with pytest.raises(ExportError, match=r"aten\.erf.*no ONNX form"):
         onnx(FrictionModel(law, Constant(law, 2)), tmp_path / "m.onnx")
@@ -146,7 +146,7 @@ def test_hostile_files_are_refused(tmp_path: Path) -> None:
 
 
 @needs_onnx
-def test_another_graph_is_not_run_and_other_numbers_are_found_out(tmp_path: Path) -> None:
+def test_other_graphs_are_not_run_and_changed_numbers_are_detected(tmp_path: Path) -> None:
     package: Any = pytest.importorskip("onnx")
     model = LFM(2, [1e-3, 2e-3])
     path = onnx(model, tmp_path / "m.onnx")

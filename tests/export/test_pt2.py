@@ -1,4 +1,4 @@
-"""torch.export programs: equal to the model at any batch."""
+"""torch.export programs: equal to the model for any batch."""
 
 import logging
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import motion, named_models
 
 MODELS = named_models()
-# The others only among the slow tests, as an export takes seconds.
+# The others are among the slow tests, as an export takes seconds.
 QUICK = ["NLFM", "NFLFM"]
 
 
@@ -33,7 +33,7 @@ def check_parity(model: FrictionModel, path: Path, points: int) -> None:
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_it_equals_the_model_to_beyond_the_range(name: str, tmp_path: Path) -> None:
+def test_program_equals_the_model_within_and_beyond_the_range(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.pt2", 5000 if not MODELS[name].state_size else 200)
 
 
@@ -46,17 +46,17 @@ def test_parity_over_very_many_points(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
-def test_the_filter_starts_by_itself(name: str, tmp_path: Path) -> None:
-    # Compared with the model as it is written.
+def test_filter_initialises_itself(name: str, tmp_path: Path) -> None:
+    # Compared with the model when it is written.
     assert pt2(MODELS[name], tmp_path / "m.pt2", INFO, with_filter=True).is_file()
 
 
-def test_a_schedule_of_ones_own_is_clamped_in_the_artefact(tmp_path: Path) -> None:
+def test_user_defined_schedule_is_clamped_in_the_artefact(tmp_path: Path) -> None:
     check_parity(rising(), tmp_path / "m.pt2", 1000)
 
 
 @pytest.mark.parametrize("batch", [1, 2, 7, 100])
-def test_any_batch(written: Path, batch: int) -> None:
+def test_any_batch_size_is_accepted(written: Path, batch: int) -> None:
     inputs = motion(batch, 3)
     files = {METADATA: ""}
     found = torch.export.load(written, extra_files=files).module()(*inputs)
@@ -64,11 +64,11 @@ def test_any_batch(written: Path, batch: int) -> None:
     assert files[METADATA].startswith("{")
 
 
-def test_it_replaces_the_file_whole_and_leaves_nothing_else(written: Path) -> None:
+def test_file_is_replaced_atomically(written: Path) -> None:
     assert list(written.parent.iterdir()) == [written]
 
 
-def test_it_is_written_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_export_is_silent(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         pt2(MODELS["NCFM"], tmp_path / "m.pt2", INFO)
     assert not caplog.records

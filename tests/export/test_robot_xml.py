@@ -1,4 +1,4 @@
-"""Patching robot descriptions: joints by name, and nothing that a robot has no use for."""
+"""Patching robot descriptions: joints by name; values that no robot can use are refused."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,7 +19,7 @@ def patch(tmp_path: Path, text: str | bytes, root: str = "robot", names: list[st
     return patched(path, root, found)
 
 
-def test_joints_are_found_by_name_and_the_rest_stays(tmp_path: Path) -> None:
+def test_joints_are_found_by_name_and_all_else_is_unchanged(tmp_path: Path) -> None:
     tree = ElementTree.fromstring(patch(tmp_path, URDF))
     found = {joint.get("name"): joint.find("dynamics") for joint in tree.iter("joint")}
     assert {name: x.attrib for name, x in found.items() if x is not None} == {
@@ -28,7 +28,7 @@ def test_joints_are_found_by_name_and_the_rest_stays(tmp_path: Path) -> None:
     }
     assert tree.find("joint/limit") is not None
     assert tree.find("link") is not None
-    # Doing it twice changes nothing more.
+    # Patching is idempotent.
     once = patch(tmp_path, URDF)
     assert patch(tmp_path, once) == once
 
@@ -45,7 +45,9 @@ def test_joints_are_found_by_name_and_the_rest_stays(tmp_path: Path) -> None:
         (URDF.replace('"a"', '"b"'), "found 2"),
     ],
 )
-def test_what_is_no_robot_is_refused(text: str | bytes, message: str, tmp_path: Path) -> None:
+def test_files_that_describe_no_robot_are_refused(
+    text: str | bytes, message: str, tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match=message):
         patch(tmp_path, text)
 

@@ -1,4 +1,4 @@
-"""Joints of simulators: what can be told exactly is, what cannot has its price told."""
+"""Joint models of simulators: exact where possible, otherwise with their error stated."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ def swing(joints: int = 2, amplitude: float = 1.0) -> Motion:
 @pytest.mark.parametrize(
     ("model", "frictionloss"), [(NCFM(2, [0.3]), 0.0), (LFM(2, [0.3, 0.7]), 0.7)]
 )
-def test_what_damping_and_friction_loss_can_say_costs_nothing(
+def test_viscous_and_coulomb_friction_are_converted_exactly(
     model: NCFM | LFM, frictionloss: float
 ) -> None:
     found = fit_damping_frictionloss(model, swing())
@@ -40,7 +40,7 @@ def test_what_damping_and_friction_loss_can_say_costs_nothing(
     assert max(found.relative_error) < 1e-9
 
 
-def test_the_price_is_the_least_there_is() -> None:
+def test_conversion_error_is_minimal() -> None:
     model = NFLFM(2, [0.1, 0.2])
     randomise(model, 0.3)
     motion = swing()
@@ -61,23 +61,25 @@ def test_the_price_is_the_least_there_is() -> None:
         assert (rms(d, factor * f) > best).all()
 
 
-def test_neither_number_feeds_energy_in() -> None:
-    # Friction that falls with speed would want negative damping.
+def test_converted_values_are_never_negative() -> None:
+    # Friction that falls with speed would require negative damping.
     falling = NLFM(1, [0.0, 1.0, 0.0, 0.0, 1.0])
     found = fit_damping_frictionloss(falling, swing(1))
     assert min(*found.damping, *found.frictionloss) >= 0
     offset = fit_damping_frictionloss(NLFM(1, [-1.0, 0.01, 0.0, 0.0, 1.0]), swing(1))
     assert min(*offset.damping, *offset.frictionloss) >= 0
-    assert offset.relative_error[0] > 0.9  # a constant offset is all lost, and it says so
+    assert (
+        offset.relative_error[0] > 0.9
+    )  # a constant offset is lost completely, and the stated error shows it
 
 
-def test_load_and_memory_go_in() -> None:
+def test_load_and_memory_are_included() -> None:
     heavy = fit_damping_frictionloss(
         LFM(2, [0.3, 0.7]), swing(), load=lambda q, qd: torch.full_like(q, 2.0)
     )
     assert heavy.frictionloss == pytest.approx([1.4, 1.4])
     adaptive = ALFM(2, torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]).repeat(2, 1, 1))
-    # Slow motion of small acceleration has the coefficients of the lowest class, fast the highest.
+    # Slow motion with low acceleration has the coefficients of the lowest class, fast the highest.
     slow, fast = swing(amplitude=0.01), swing(amplitude=5.0)
     assert fit_damping_frictionloss(adaptive, slow).damping == pytest.approx([0.1, 0.1], rel=1e-6)
     # The first joint starts without acceleration, in the lowest class.
@@ -86,7 +88,7 @@ def test_load_and_memory_go_in() -> None:
     assert max(both.relative_error) > 1e-6
 
 
-def test_a_motion_that_says_nothing_is_refused() -> None:
+def test_uninformative_motion_is_refused() -> None:
     still = Motion(TIME, *(np.zeros((len(TIME), 2)) for _ in range(3)))
     with pytest.raises(ValueError, match="does not move"):
         fit_damping_frictionloss(LFM(2), still)
@@ -106,7 +108,7 @@ ROBOT = """<mujoco><!-- kept -->
 </mujoco>"""
 
 
-def test_mujoco_damps_as_the_numbers_say(tmp_path: Path) -> None:
+def test_mujoco_applies_the_damping_values(tmp_path: Path) -> None:
     mujoco: Any = pytest.importorskip("mujoco")
     (tmp_path / "robot.xml").write_text(ROBOT)
     info = ModelInfo(joint_names=["elbow", "shoulder"])
@@ -123,7 +125,7 @@ def test_mujoco_damps_as_the_numbers_say(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["lugre", "dahl"])
-def test_bristles_move_in_mujoco_as_in_a_rollout(name: str, tmp_path: Path) -> None:
+def test_bristles_in_mujoco_agree_with_a_rollout(name: str, tmp_path: Path) -> None:
     mujoco: Any = pytest.importorskip("mujoco", minversion="4.0")
     body = '<body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="0.5"/></body>'
     option = '<option timestep="1e-4" gravity="0 0 0" integrator="implicitfast"/>'
@@ -146,7 +148,7 @@ def test_bristles_move_in_mujoco_as_in_a_rollout(name: str, tmp_path: Path) -> N
     zero = torch.zeros(1, dtype=torch.float64)
     tau = torch.tensor(force)[:, None]
     run = rollout(LinearAxis(0.5), model, zero, zero, tau, sample_time=1e-4)
-    # MuJoCo's steps are of first order.
+    # MuJoCo's steps are first-order accurate.
     assert np.ptp(positions) > 0.05
     np.testing.assert_allclose(positions, run.q[1:, 0].numpy(), atol=1e-3 * np.ptp(positions))
     mjcf(model, tmp_path / "part.xml", swing(1), info)
@@ -155,7 +157,7 @@ def test_bristles_move_in_mujoco_as_in_a_rollout(name: str, tmp_path: Path) -> N
         urdf(model, tmp_path / "out.urdf", swing(1), info)
 
 
-def test_a_joints_friction_is_replaced_in_a_file_that_has_some(tmp_path: Path) -> None:
+def test_existing_friction_in_a_file_is_replaced(tmp_path: Path) -> None:
     others = '<dcmotor joint="shoulder" input="none" lugre="1 0 1 1 1"/><motor joint="elbow"/>'
     path, info = tmp_path / "robot.xml", ModelInfo(joint_names=["elbow"])
     path.write_text(ROBOT.replace("</mujoco>", f"<actuator>{others}</actuator></mujoco>"))
@@ -173,9 +175,9 @@ def test_a_joints_friction_is_replaced_in_a_file_that_has_some(tmp_path: Path) -
     assert "<motor " in path.read_text()
 
 
-def test_the_snippets_load_and_tell_their_price(tmp_path: Path) -> None:
+def test_snippets_load_and_state_their_error(tmp_path: Path) -> None:
     mujoco: Any = pytest.importorskip("mujoco")
-    info = ModelInfo(joint_names=['a "b" --', "c"])  # as awkward as names can be
+    info = ModelInfo(joint_names=['a "b" --', "c"])  # awkward names
     found = mjcf(LFM(2, [0.3, 0.7]), tmp_path / "friction.xml", swing(), info)
     mujoco.MjModel.from_xml_path(str(tmp_path / "friction.xml"))
     assert "RMS" in (tmp_path / "friction.xml").read_text()

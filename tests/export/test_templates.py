@@ -1,4 +1,4 @@
-"""The files that exported C is made of travel with the package."""
+"""The templates of exported C are part of the package."""
 
 from importlib import resources
 
@@ -9,7 +9,7 @@ NAMES = ["adaptive.c", "arduino.ino", "controller.c", "controller.h", "exponenti
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_template_is_found_where_the_package_is(name):
+def test_template_is_found_in_the_package(name):
     template = resources.files("nfriction.export").joinpath("templates", name)
     text = template.read_text("ascii")
-    assert "nf_" in text or "NF_" in text  # in place of which the prefix is written
+    assert "nf_" in text or "NF_" in text  # placeholder of the prefix

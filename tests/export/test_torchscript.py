@@ -1,4 +1,4 @@
-"""TorchScript: equal to the model, alone with torch, silent, and never half written."""
+"""TorchScript: equal to the model, needs only torch, silent, never partially written."""
 
 import json
 import subprocess
@@ -22,7 +22,7 @@ from nfriction.io.model_file import ModelInfo, parameter_hash
 from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import QUADRATIC, named_models, randomise
 
-# Whatever the export lets through fails the test.
+# Any warning that the export does not suppress fails the test.
 pytestmark = pytest.mark.filterwarnings("error")
 
 
@@ -41,24 +41,24 @@ def assert_equal(model: FrictionModel, path: Path) -> None:
     with torch.no_grad():
         expected, found = model(*inputs), load(path)(*inputs)
     assert found.dtype == torch.float64
-    # Sums may be taken in another order: some roundings of full scale.
+    # Sums may be taken in another order: a few rounding errors of full scale.
     assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
 
 
 @pytest.mark.parametrize("name", named_models())
-def test_every_named_model_scripts_silently_and_equals_itself(name: str, tmp_path: Path) -> None:
+def test_scripted_models_equal_the_original_without_warnings(name: str, tmp_path: Path) -> None:
     model = named_models()[name]
     training = model.training
     path = torchscript(model, tmp_path / "model.pt")
     if not model.state_size:
         assert_equal(model, path)
-    # The model itself stays as it was.
+    # The model itself is unchanged.
     assert model.training == training
     assert all(p.requires_grad for p in model.parameters())
 
 
 @pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
-def test_a_law_of_ones_own_scripts(make: type, tmp_path: Path) -> None:
+def test_user_defined_law_is_scripted(make: type, tmp_path: Path) -> None:
     model = FrictionModel(QUADRATIC, make(QUADRATIC, 2))
     randomise(model, 0.3)
     assert_equal(model, torchscript(model, tmp_path / "own.pt"))
@@ -99,7 +99,7 @@ json.dump(told, sys.stdout)
 """
 
 
-def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
+def test_file_runs_and_contains_its_contract_with_torch_alone(tmp_path: Path) -> None:
     model = named_models()["NFNLFM"]
     info = ModelInfo(
         joint_names=["a", "b", "c"], sample_time=1e-3, input_ranges={"qd": [[-1.0, 1.0]] * 3}
@@ -115,12 +115,12 @@ def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
     found = torch.load(tmp_path / "outputs", weights_only=True)
     expected = model(*inputs).detach()
     assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
-    told = json.loads(run.stdout)
-    assert told["joint_names"] == ["a", "b", "c"]
-    assert told["sample_time"] == 1e-3
-    assert told["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
-    assert told["units"]["tau_f"] == "N m"
-    assert told["parameter_hash"] == parameter_hash(model.state_dict())
+    contract = json.loads(run.stdout)
+    assert contract["joint_names"] == ["a", "b", "c"]
+    assert contract["sample_time"] == 1e-3
+    assert contract["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
+    assert contract["units"]["tau_f"] == "N m"
+    assert contract["parameter_hash"] == parameter_hash(model.state_dict())
     assert METADATA == "nfriction.json"  # others read it by this name
 
 
@@ -128,7 +128,7 @@ def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", named_models())
-def test_step_gives_all_of_the_contract_to_beyond_the_range(name: str, tmp_path: Path) -> None:
+def test_step_fulfils_the_contract_within_and_beyond_the_range(name: str, tmp_path: Path) -> None:
     model = named_models()[name]
     check_parity(model, tmp_path / "model.pt", 5000 if not model.state_size else 300)
 
@@ -149,12 +149,12 @@ def check_parity(model: FrictionModel, path: Path, points: int) -> None:
     assert parity.passed, parity
 
 
-def test_a_schedule_of_ones_own_is_clamped_in_the_artefact(tmp_path: Path) -> None:
+def test_user_defined_schedule_is_clamped_in_the_artefact(tmp_path: Path) -> None:
     check_parity(rising(), tmp_path / "model.pt", 1000)
 
 
-def test_nan_and_infinity_give_nan_from_the_short_call_too(tmp_path: Path) -> None:
-    model = named_models()["NCFM"]  # whose law looks at neither acceleration nor load
+def test_nan_and_infinity_give_nan_in_the_short_call_too(tmp_path: Path) -> None:
+    model = named_models()["NCFM"]  # whose law uses neither acceleration nor load
     loaded = load(torchscript(model, tmp_path / "model.pt"))
     for which in range(3):
         for bad in (torch.nan, torch.inf, -torch.inf):
@@ -166,12 +166,12 @@ def test_nan_and_infinity_give_nan_from_the_short_call_too(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
-def test_the_filter_inside_equals_the_one_outside(name: str, tmp_path: Path) -> None:
+def test_exported_filter_equals_the_external_one(name: str, tmp_path: Path) -> None:
     model = named_models()[name]
     path = torchscript(model, tmp_path / "model.pt", INFO, with_filter=True)
     assert contract_of_archive(path).state_size == 6 + model.state_size
     if not model.state_size:
-        assert_equal(model, path)  # the short call takes motions as ever
+        assert_equal(model, path)  # the short call still takes motions
 
 
 # Refusals
@@ -203,15 +203,15 @@ def without_annotations(qd, load, coefficients, v_smooth):
     ],
     ids=["lambda", "numpy", "any number", "without annotations"],
 )
-def test_what_does_not_script_is_refused_and_leaves_nothing_behind(
+def test_unscriptable_models_are_refused_without_leftover_files(
     function: TorqueFunction, message: str, tmp_path: Path
 ) -> None:
     model = FrictionModel(law(function), Constant(law(function), 2))
-    for _ in range(2):  # a second try must say the same
+    for _ in range(2):  # a second attempt must give the same message
         with pytest.raises(ExportError, match=f"(?s){message}"):
             torchscript(model, tmp_path / "model.pt")
     assert not list(tmp_path.iterdir())
-    # Nor does it spoil what comes after.
+    # Later exports are unaffected.
     torchscript(LFM(2), tmp_path / "good.pt")
 
 
@@ -232,7 +232,7 @@ def test_an_artefact_that_differs_from_its_model_is_not_written(tmp_path: Path) 
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_names_of_the_joints_must_be_one_a_joint(tmp_path: Path) -> None:
+def test_joint_names_must_match_the_number_of_joints(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="name 2 joints"):
         torchscript(LFM(2), tmp_path / "model.pt", ModelInfo(joint_names=["a"]))
 

@@ -1,4 +1,4 @@
-"""Proofs of artefacts: those of the model pass, those of another model or doctored ones do not."""
+"""Verification of artefacts: those of the model pass; altered ones and other models' fail."""
 
 import json
 import subprocess
@@ -30,7 +30,7 @@ MODELS = named_models()
 
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
-def test_torchscript_is_its_model(name: str, tmp_path: Path) -> None:
+def test_torchscript_passes(name: str, tmp_path: Path) -> None:
     path = torchscript(MODELS[name], tmp_path / "m.pt", INFO, torque_limit=[5.0, 6.0, 7.0])
     verdict = verify_artefact(path, MODELS[name], INFO, points=200)
     assert verdict.passed
@@ -39,7 +39,7 @@ def test_torchscript_is_its_model(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("write", "name"), [(torchscript, "m.pt"), (pt2, "m.pt2")])
-def test_a_joint_with_one_torque_limit_is_its_model(write: Any, name: str, tmp_path: Path) -> None:
+def test_one_joint_with_a_torque_limit_passes(write: Any, name: str, tmp_path: Path) -> None:
     model = LFM(1, [0.1, 0.2])
     path = write(model, tmp_path / name, torque_limit=0.2)
     assert verify_artefact(path, model, points=50).passed
@@ -49,14 +49,14 @@ def test_a_joint_with_one_torque_limit_is_its_model(write: Any, name: str, tmp_p
 @pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
 @pytest.mark.parametrize("with_filter", [False, True])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_c_is_its_model(name: str, with_filter: bool, dtype: str, tmp_path: Path) -> None:
+def test_c_passes(name: str, with_filter: bool, dtype: str, tmp_path: Path) -> None:
     c(MODELS[name], tmp_path, INFO, name="m", with_filter=with_filter, dtype=dtype)
     verdict = verify_artefact(tmp_path / "m.c", MODELS[name], INFO, points=200)
     assert verdict.passed, verdict
 
 
 def vanishing(names: set[str]) -> NFNLFM:
-    """A model whose named coefficients training has driven to some 1e-9 of their scale."""
+    """A model whose named coefficients training has driven to about 1e-9 of their scale."""
     model = NFNLFM(3)
     randomise(model, 0.1)
     chosen = [name in names for name in model.law.names]
@@ -72,13 +72,11 @@ ONE, ALL = {"f_a"}, {"f_c", "f_v", "f_a", "f_b"}
     ("kind", "names"),
     [
         *(("c", ONE), ("c float", ONE), ("pt", ONE), ("c", ALL), ("c float", ALL), ("pt", ALL)),
-        # The same arithmetic as a `.pt`, in forms that take long to write.
+        # The same arithmetic as a `.pt`, in formats that are slow to write.
         *(pytest.param(kind, ALL, marks=pytest.mark.slow) for kind in ("onnx", "onnx float")),
     ],
 )
-def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(
-    kind: str, names: set[str], tmp_path: Path
-) -> None:
+def test_coefficient_near_zero_passes(kind: str, names: set[str], tmp_path: Path) -> None:
     """It is a small difference of large numbers: rounding errors are relative to those."""
     if kind.startswith("c") and find_compiler() is None:
         pytest.skip("needs a C compiler")
@@ -86,7 +84,7 @@ def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(
     ending, _, single = kind.partition(" ")
     dtype = {"dtype": "float32"} if single else {}
     path = tmp_path / f"m.{ending}"
-    if ending != "c":  # compared with the model as it is written
+    if ending != "c":  # compared with the model when it is written
         {"pt": torchscript, "onnx": onnx}[ending](model, path, INFO, **dtype)
         return
     c(model, tmp_path, INFO, name="m", **dtype)
@@ -96,7 +94,7 @@ def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(
         subprocess.run(command, cwd=tmp_path, check=True)
 
 
-def test_an_error_that_the_torque_feels_is_found_beside_a_coefficient_near_zero() -> None:
+def test_torque_error_is_found_despite_a_coefficient_near_zero() -> None:
     model = vanishing({"f_a"})
     controller = controller_of(model, INFO)
     contract = contract_of(model, controller, INFO)
@@ -117,21 +115,21 @@ def test_an_artefact_is_not_judged_by_its_own_scales(tmp_path: Path) -> None:
         pytest.skip("needs a C compiler")
     other = LFM(3, [1e-3, 2.1e-3])
     c(other, tmp_path, INFO, name="m")
-    beside = tmp_path / "m.contract.json"
-    content = json.loads(beside.read_text())
+    contract = tmp_path / "m.contract.json"
+    content = json.loads(contract.read_text())
     content["tolerance"] = 0.9
     content["scales"] = {name: [1e9] * len(x) for name, x in content["scales"].items()}
-    beside.write_text(json.dumps(content))
+    contract.write_text(json.dumps(content))
     verdict = verify_artefact(tmp_path / "m.c", LFM(3, [1e-3, 2e-3]), INFO, points=100)
     assert not verdict.points.passed
 
 
-def test_an_artefact_of_another_model_is_found_out(tmp_path: Path) -> None:
+def test_artefact_of_another_model_is_detected(tmp_path: Path) -> None:
     other = LFM(3, [1e-3, 2e-3])
     randomise(other, 1e-9)
     path = torchscript(other, tmp_path / "m.pt", INFO)
     verdict = verify_artefact(path, LFM(3, [1e-3, 2e-3]), INFO)
-    assert verdict.vectors.passed  # it is what it says, but
+    assert verdict.vectors.passed  # it is consistent with its own vectors, but
     assert not verdict.points.passed
     assert not verdict.passed
     assert ["parameters" in x for x in verdict.differences] == [True]
@@ -147,7 +145,7 @@ def test_an_artefact_of_another_law_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
-def test_doctored_c_is_found_out(tmp_path: Path) -> None:
+def test_altered_c_is_detected(tmp_path: Path) -> None:
     c(MODELS["LFM"], tmp_path, INFO, name="m")
     source = tmp_path / "m.c"
     text = source.read_text()
@@ -158,11 +156,11 @@ def test_doctored_c_is_found_out(tmp_path: Path) -> None:
     source.write_text("no C at all")
     with pytest.raises(ExportError, match="failed"):
         verify_artefact(source, MODELS["LFM"], INFO)
-    beside = tmp_path / "m.contract.json"
-    beside.write_text(beside.read_text()[:-100])
+    contract = tmp_path / "m.contract.json"
+    contract.write_text(contract.read_text()[:-100])
     with pytest.raises(ContractError, match="cut short"):
         verify_artefact(source, MODELS["LFM"], INFO)
-    beside.unlink()
+    contract.unlink()
     with pytest.raises(ContractError, match="not in the same folder"):
         verify_artefact(source, MODELS["LFM"], INFO)
 

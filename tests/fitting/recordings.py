@@ -1,4 +1,4 @@
-"""Simulated recordings with known friction, as an encoder reports them."""
+"""Simulated recordings with known friction, sampled by an encoder."""
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ def pendulum(**settings) -> PendulumChain:
 
 
 def one_link() -> PendulumChain:
-    """The least mechanism on which a fit has all its stages."""
+    """The simplest mechanism with which a fit has all its stages."""
     return PendulumChain([0.3], [0.2], inertia=[1e-3])
 
 
@@ -35,7 +35,7 @@ def swing(
     convention: str = "relative,upright",
     name: str = "swing",
 ) -> Recording:
-    """A release from rest, quantised in the convention it is written in."""
+    """A release from rest, quantised in the recording's convention."""
     start = (1.6, 0.8)[: plant.joints] if start is None else start
     steps = sample_time if isinstance(sample_time, np.ndarray) else None
     count = round(seconds / sample_time) if steps is None else len(steps)

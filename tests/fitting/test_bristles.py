@@ -25,7 +25,7 @@ def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
     time = np.linspace(0.0, 8.0, 800)
     q = reach * 0.06 * np.sin(1.7 * time + seed) * (0.1 + np.sin(0.43 * time) ** 2)
     q += reach * 0.003 * np.sin(6.1 * time + 1)
-    # Drives the joint and is driven back; only a gear reads it.
+    # Drives the joint and is backdriven; only the gear law uses it.
     load = 1.0 + 6.0 * np.sin(2.3 * time + 0.5 * seed)
     given = pd.DataFrame({"time": time, "q": q, "qd": np.gradient(q, time), "tau": q, "load": load})
     joint = TorqueTable.from_pandas(given).joints[0]
@@ -36,11 +36,11 @@ def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
 
 @cache
 def fitted(name: str) -> TorqueFits:
-    """The fit of the law that made the table."""
+    """Fit of the true law to the table."""
     return fit_torque(table_of(name), name, folds=2)
 
 
-# Of its relatives LuGre has all coefficients but one.
+# LuGre has all coefficients of the bristle laws but one.
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=[pytest.mark.slow] * (x in {"ElastoPlastic", "Gear"})) for x in TRUE],
@@ -52,12 +52,12 @@ def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
         row = values.loc[f"{coefficient.name} of joint1"]
         assert abs(row["value"] - true) < 0.15 * true
         if coefficient.fitted:
-            # Twice the interval, of which one in a thousand lies outside.
+            # Twice the interval, outside which one in a thousand lies.
             assert abs(row["value"] - true) < row["high"] - row["low"]
     assert float(found.score(table_of(name, seed=3))["rmse"].iloc[0]) < 0.018
 
 
-def test_a_batch_of_coefficients_gives_the_torque_of_each() -> None:
+def test_batched_coefficients_give_the_torque_of_each() -> None:
     joint = TorqueTable.from_pandas(table_of("LuGre")).joints[0]
     sets = np.array([TRUE["LuGre"], (0.5, 0.1, 0.05, 100.0, 1.0, 0.1)])
     found = torques(model_by_name("LuGre")(1).law, joint, sets)
@@ -75,7 +75,7 @@ def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
 
 
 @pytest.mark.slow
-def test_rows_that_only_slide_are_fitted() -> None:
+def test_rows_with_sliding_only_are_fitted() -> None:
     time = np.arange(1000) * 0.02
     qd = np.where(time < 10.0, 1.0, -0.9) * (1.5 + 0.5 * np.sin(0.7 * time))
     tau = 0.3 * np.sign(qd) + 0.1 * qd + 0.005 * np.random.default_rng(0).normal(size=len(time))
@@ -84,6 +84,6 @@ def test_rows_that_only_slide_are_fitted() -> None:
     assert "sigma_0 of joint1" in found.fits["LuGre"][0].unidentifiable
 
 
-def test_maxwell_slip_is_referred_to_slip() -> None:
+def test_maxwell_slip_is_redirected_to_slip() -> None:
     with pytest.raises(ValueError, match="use slip"):
         fit_torque(table_of("Dahl"), "maxwell-slip", folds=2)

@@ -1,4 +1,4 @@
-"""The delay of the torque is fitted beside the friction, with its interval."""
+"""The delay of the torque is estimated together with the friction, with its interval."""
 
 import re
 
@@ -40,18 +40,18 @@ def driven_pendulum(seed: int, size: float, v_smooth: float) -> Recording:
 
 
 def delayed(name: str = "axis", seconds: float = 3.0) -> Recording:
-    """A driven axis whose torque is logged late, by no whole number of samples."""
+    """A driven axis whose torque is logged late by a non-integer number of samples."""
     clean = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=seconds)
     return clean._replace(tau=clean.torque_at(clean.time - LATE), name=name)
 
 
-def test_a_fitted_delay_is_found_with_its_interval():
+def test_fitted_delay_is_recovered_within_its_interval():
     recording, axis = delayed(), LinearAxis(2.0)
     settings = {"windows": (0.5, 1.5), "fit_plant": False}
     late = fit(CVFM(1, v_smooth=0.05), axis, recording, **settings)
     found = fit(CVFM(1, v_smooth=0.05), axis, recording, fit_delay=True, **settings)
     assert found.converged
-    # Half a sample: the torque is held over a sample, and the log between them is a line.
+    # Half a sample: the torque is held over a sample, and the log is interpolated linearly.
     assert found.torque_delay == pytest.approx(LATE, abs=1e-3)
     assert score_fit(found, recording, limit=False).free_run.all < 0.1 * late.residual
     (interval,) = (i for i in found.intervals if i.name == TORQUE_DELAY)
@@ -62,7 +62,7 @@ def test_a_fitted_delay_is_found_with_its_interval():
         for f in (late, found)
     ]
     assert errors[1] < min(0.02, 0.1 * errors[0])
-    # A mistake that is fitted is none; otherwise it is named, with its cure.
+    # A fitted delay raises no warning; otherwise it is named with its remedy.
     assert found.mistakes == ()
     assert "`fit_delay=True`" in late.warnings[0]
     assert late.torque_delay == 0.0
@@ -75,11 +75,11 @@ def test_scores_use_the_fitted_delay():
     late = compare(LinearAxis(2.0), "CVFM", train, test, **settings)
     found = compare(LinearAxis(2.0), "CVFM", train, test, fit_delay=True, **settings)
     assert found.table().loc["CVFM", "all"] < 0.1 * late.table().loc["CVFM", "all"]
-    # A figure shows the recording, of which every sample is simulated.
+    # A figure shows the recording; every sample of it is simulated.
     assert found.scores()["CVFM"][0].simulated.shape == test.q.shape
 
 
-def test_gradient_by_the_delay_is_that_of_the_cost():
+def test_gradient_with_respect_to_the_delay_is_that_of_the_cost():
     recording, axis = delayed(), LinearAxis(2.0)
     options = FitOptions(fit_delay=True)
     terms = adjustable_terms(axis, CVFM(1).law, [recording], options)
@@ -93,7 +93,7 @@ def test_gradient_by_the_delay_is_that_of_the_cost():
     k = problem.variables.shared_count - 1
     assert terms[-1].name == TORQUE_DELAY
     x[k] = 0.0051
-    # The slope is that over a sample, so the difference is taken over one.
+    # The slope is taken over a sample, hence the difference too.
     step = torch.zeros_like(x)
     step[k] = 1e-3
     slope = (problem.cost(x + step) - problem.cost(x - step)) / 2e-3
@@ -116,50 +116,50 @@ def test_a_delay_needs_torques_and_simulated_windows():
         FitOptions(method="equation_error", fit_delay=True)
 
 
-def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
-    """A torque that changes within samples; the log holds what was measured at each."""
+def test_half_a_sample_of_delay_is_reported():
+    """A torque that changes within samples; the log contains the value measured at each."""
     fine = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=3.0)
     measured, settings = fine[::10], {"windows": (0.5, 1.5)}
     found = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **settings)
-    (said,) = (text for text in found.warnings if "`fit_delay=True`" in text)
-    # Held over a sample of the simulation, it is early by half of that.
+    (warning,) = (text for text in found.warnings if "`fit_delay=True`" in text)
+    # Held over a sample of the simulation, it is half a sample early.
     late = 0.5 * (measured.sample_time - fine.sample_time)
-    (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", said)
+    (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", warning)
     assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
-    # Friction depends on the delay, also that of a model which starts from such a fit.
-    assert "F_c of joint1 0.8" in said
+    # Friction depends on the delay, also in a model that starts from such a fit.
+    assert "F_c of joint1 0.8" in warning
     start = {"start": found, "windows": (0.5,), "max_steps": 9}
     by_class = fit(ACVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **start)
-    for told in (found, by_class):
-        assert told.usability[0] == "doubtful"
-        assert "later than" in told.usability[1]
+    for result in (found, by_class):
+        assert result.usability[0] == "doubtful"
+        assert "later than" in result.usability[1]
     held = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), fine, **settings)
     assert not any("delay" in text for text in held.warnings)
 
 
 @pytest.mark.parametrize(
     ("motion", "verdict"),
-    # The last one needs more steps of the integration at the start of the search than at its end.
+    # The last case needs more integration steps at the start of the search than at its end.
     [
         ((3, 0.1, 0.003), "doubtful"),
         ((1, 0.1, 0.003), "good"),
         pytest.param((0, 0.45, 0.05), "doubtful", marks=pytest.mark.slow),
     ],
 )
-def test_a_delay_makes_a_fit_doubtful_where_coefficients_leave_their_intervals(motion, verdict):
+def test_fit_is_doubtful_if_the_delay_moves_coefficients_significantly(motion, verdict):
     recording, truth = driven_pendulum(*motion), np.ravel(DRY)
     found, right = (
         fit(CVFM(2), pendulum(), recording, windows=(0.5,), fit_delay=fitted)
         for fitted in (False, True)
     )
-    said = "".join(text for text in found.warnings if "Perhaps torques" in text)
+    warning = "".join(text for text in found.warnings if "Perhaps torques" in text)
     own = {i.name: (i, x) for i, x in zip(found.intervals[:4], truth, strict=True)}
     assert found.usability[0] == verdict
     assert all(i.low <= x <= i.high for i, x in own.values()) == (verdict == "good")
-    # A delay below one sample that no coefficient depends on is not worth a sentence.
-    assert bool(said) == (verdict == "doubtful")
-    named = re.findall(r"(\w+ of joint\d) ([\d.]+)", said)
-    assert bool(named) == bool(said)
+    # A delay below one sample on which no coefficient depends is not reported.
+    assert bool(warning) == (verdict == "doubtful")
+    named = re.findall(r"(\w+ of joint\d) ([\d.]+)", warning)
+    assert bool(named) == bool(warning)
     for name, value in named:
         assert float(value.rstrip(".")) == pytest.approx(own[name][1], rel=0.03)
     np.testing.assert_allclose(np.ravel(right.model.schedule.values), truth, rtol=0.03)

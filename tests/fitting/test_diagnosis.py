@@ -1,4 +1,4 @@
-"""Typical mistakes in recordings and rigs are named, and sound data raise no alarm."""
+"""Typical mistakes in recordings and rigs are named; valid data raise no warning."""
 
 import functools
 import math
@@ -57,7 +57,7 @@ def torque(peaks: list[float], seed: int) -> np.ndarray:
 
 @functools.cache
 def measured(name: str, count: float | None = COUNT) -> tuple[Plant, np.ndarray, np.ndarray | None]:
-    """Rig, positions in joint coordinates as encoders round them, and torques."""
+    """Rig, positions in joint coordinates as quantised by encoders, and torques."""
     plants = {"free": PendulumChain(**DOUBLE), "driven": PendulumChain(**DOUBLE),
               "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13),
               "direct": PendulumChain(**MOTOR | {"armature": [0.0], "inertia": [0.0575]}),
@@ -92,7 +92,7 @@ def later(values: np.ndarray, samples: int) -> np.ndarray:
     return np.concatenate([np.repeat(values[:1], samples, 0), values[:-samples]])
 
 
-def test_a_motor_that_is_mounted_the_other_way_round_is_named():
+def test_reversed_motor_is_named():
     plant, q, tau = measured("driven")
     # From hanging, so that reversed signs are another motion.
     hanging = (q - [math.pi, 0.0]) * [1, -1]
@@ -101,14 +101,14 @@ def test_a_motor_that_is_mounted_the_other_way_round_is_named():
 
 
 def test_a_wrong_gear_ratio_of_a_motor_is_named():
-    """Of angle and torque at once, which no other cause scales so."""
+    """In angle and torque at once, which no other cause scales in this way."""
     _, q, tau = measured("driven")
     geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 40.0], torque_constant=0.1))
     (found, *_) = warnings_of(geared, q * [1, 1 / 1.5], tau * [1, 1.5])
     assert re.search(r"the gear ratio of joint2 is (0\.66|0\.67)\d* times that of the rig", found)
 
 
-def test_exchanged_columns_of_motors_with_other_gears_are_named():
+def test_exchanged_columns_of_motors_with_different_gears_are_named():
     _, q, tau = measured("driven")
     geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 30.0], torque_constant=[0.1, 0.2]))
     factors = geared.motor_factors
@@ -126,7 +126,7 @@ def test_motors_in_the_base_are_named_with_a_remedy_for_motors():
     assert "angles are absolute, not relative (a belt drive? convert its columns)" in found
 
 
-def test_a_torque_of_coarse_steps_is_neither_clipped_nor_stuck():
+def test_coarsely_quantised_torque_is_neither_clipped_nor_stuck():
     plant, q, tau = measured("motor")
     noisy = tau + 0.05 * np.random.default_rng(0).normal(size=tau.shape)
     found = warnings_of(plant, q, 0.1 * np.round(noisy / 0.1))
@@ -134,8 +134,8 @@ def test_a_torque_of_coarse_steps_is_neither_clipped_nor_stuck():
     assert not any("clipped" in w for w in found)
 
 
-def test_a_torque_that_turns_sharply_has_no_spike():
-    """As where friction takes over from a drive at rest."""
+def test_sharp_torque_reversal_is_no_spike():
+    """As when friction replaces a drive at rest."""
     time = STEP * np.arange(SAMPLES)
     tau = np.sin(2 * math.pi * 0.3 * time)
     tau += 0.8 * np.abs(np.mod(time, 2.0) - 1.0)
@@ -145,7 +145,7 @@ def test_a_torque_that_turns_sharply_has_no_spike():
     assert len([*inputs._spikes([spiked], FitOptions())]) == 1
 
 
-def test_a_gain_of_one_drive_beyond_the_usual_is_named():
+def test_unusual_gain_of_one_drive_is_named():
     plant, q, tau = measured("driven")
     time, convention = STEP * np.arange(len(q)), "relative,upright"
     recording = Recording(time, q, tau * [1.0, 1.25], convention=convention)
@@ -156,7 +156,7 @@ def test_a_gain_of_one_drive_beyond_the_usual_is_named():
 
 
 @pytest.mark.parametrize(("grown", "named"), [(0.2, True), (1.0, False)])
-def test_a_scale_of_the_torque_that_changes_is_no_change_of_friction(grown, named):
+def test_torque_scale_that_changes_is_no_change_of_friction(grown, named):
     """It differs by no more than the torque constants of two drives may."""
     rig, recordings, rng = LinearAxis(3.5), [], np.random.default_rng(0)
     time = 0.004 * np.arange(2001)[:, None]
@@ -171,17 +171,17 @@ def test_a_scale_of_the_torque_that_changes_is_no_change_of_friction(grown, name
         q = q + 1e-5 * rng.normal(size=q.shape)
         recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
-    said = dict(changing_friction(rig, recordings, motions, FitOptions()))
-    assert ("scale" in said) == named
+    warned = dict(changing_friction(rig, recordings, motions, FitOptions()))
+    assert ("scale" in warned) == named
     if named:
         grows = r"scale of the force of joint1 grows by (19|2[01])\.?\d* ± "
-        assert re.search(grows, said.pop("scale"))
-        assert not said
+        assert re.search(grows, warned.pop("scale"))
+        assert not warned
 
 
 @pytest.mark.parametrize("reason", ["too long", "lossy"])
-def test_skipped_windows_of_a_single_free_link_blame_the_law(reason, monkeypatch):
-    """Its motion is not chaotic, and it has no torque whose errors could add up."""
+def test_skipped_windows_of_a_single_free_link_indicate_a_wrong_law(reason, monkeypatch):
+    """Its motion is not chaotic, and there are no torque errors that could accumulate."""
 
     def skipping(*given):
         return replace(searched(*given), skipped=(2.0,), reason=reason)
@@ -196,7 +196,7 @@ def test_skipped_windows_of_a_single_free_link_blame_the_law(reason, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])
-def test_sound_data_raise_no_alarm(name):
+def test_valid_data_raise_no_warning(name):
     assert warnings_of(*measured(name)) == ()
 
 
@@ -208,7 +208,7 @@ def test_small_motion_near_the_vertical_is_not_at_the_horizontal():
     assert warnings_of(plant, q, torque([1.0], 4)) == ()
 
 
-def test_a_moment_of_a_motion_names_no_mistake():
+def test_very_short_recording_names_no_mistake():
     """Corrections explain the few torques of a short recording by chance."""
     plant, model = pendulum(), LFM(2, [[2e-3, 3e-3]] * 2)
     recording = swing(plant, model, seconds=0.3)
@@ -217,13 +217,14 @@ def test_a_moment_of_a_motion_names_no_mistake():
 
 @functools.cache
 def warming(change: float, chirp: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and torques of the motor with a Stribeck friction that changes linearly by this."""
+    """Positions and torques of the motor with Stribeck friction that changes linearly by this
+    factor."""
     time = STEP * np.arange(SAMPLES)
     swept = (0.5 + 0.3 * time) * np.sin(2 * math.pi * (0.2 + 0.12 * time) * time)
     tau = swept[:, None] if chirp else torque([3.0], 3)
     state, parts = torch.zeros(2, 1, dtype=torch.float64), []
     state[0] = math.pi
-    # A piece of a tenth of the recording each, with its own friction.
+    # Ten segments of the recording, each with its own friction.
     for k, part in enumerate(np.array_split(tau[:-1], 10)):
         level = 1 + change * (k - 4.5) / 9
         model = Stribeck(1, [[0.3 * level, 0.1 * level, 0.12 * level, 0.3, 2.0]])
@@ -258,12 +259,12 @@ def geared(play: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("play", "named"), [(1.0, True), (0.0, False)])
 def test_play_in_a_gear_is_named(play, named):
-    said = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
-    shares = [re.search(r"gear of joint1 has play: .* (\d+) ± ", w) for w in said]
+    warned = warnings_of(PendulumChain(**MOTOR), *geared(math.radians(play)))
+    shares = [re.search(r"gear of joint1 has play: .* (\d+) ± ", w) for w in warned]
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
 
 
-def test_a_fit_to_a_motor_whose_gear_has_play_is_doubtful():
+def test_fit_with_play_in_the_gear_is_doubtful():
     q, tau = geared(math.radians(1.0))
     recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
     given = {"windows": (0.1,), "max_steps": 1}
@@ -275,7 +276,7 @@ def test_a_fit_to_a_motor_whose_gear_has_play_is_doubtful():
 
 
 @pytest.mark.parametrize("samples", [50, 130, 200])
-def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
+def test_short_recording_is_not_tested_for_play(samples):
     q, tau = geared(math.radians(1.0))
     short = Recording(
         STEP * np.arange(samples), q[:samples], tau[:samples], convention="relative,upright"
@@ -286,8 +287,8 @@ def test_a_gear_is_not_examined_in_a_recording_too_short_for_it(samples):
 
 @pytest.mark.parametrize("change", [0.3, -0.3])
 def test_a_friction_that_changes_within_a_recording_is_named(change):
-    said = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
-    named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in said]
+    warned = warnings_of(PendulumChain(**MOTOR), *warming(change, chirp=False))
+    named = [re.search(r"friction of joint1 (\w+) by (\S+) ± (\S+) %", w) for w in warned]
     ((way, found, within),) = (match.groups() for match in named if match)
     assert way == ("grows" if change > 0 else "falls")
     start, end = 1 - change / 2, 1 + change / 2
@@ -295,8 +296,8 @@ def test_a_friction_that_changes_within_a_recording_is_named(change):
 
 
 @pytest.mark.parametrize(("fall", "constants"), [(0.0, 1), (0.2, 0.01), (0.2, 4)])
-def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
-    """As a warm-up over some of its time constants."""
+def test_change_is_detected_if_friction_dominates_the_torque(fall, constants):
+    """As in a warm-up over several of its time constants."""
     rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
     phase, rng = rate * time, np.random.default_rng(0)
     q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)
@@ -307,17 +308,17 @@ def test_a_change_is_seen_where_friction_is_most_of_the_torque(fall, constants):
     tau += 0.1 * rng.normal(size=q.shape)
     recording = Recording(time[:, 0], q, tau, unit="m")
     motions = [kalman_smoother(recording.time, recording.q)]
-    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
-    assert len(said) == (fall > 0)
-    for changed, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert len(warned) == (fall > 0)
+    for changed, sentence in warned:
         assert changed == "friction"
         found, within = re.search(r"falls by (\S+) ± (\S+) %", sentence).groups()
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
 @pytest.mark.parametrize("drift", [0.0, 1.0, -1.0])
-def test_an_offset_of_a_force_sensor_that_drifts_is_named(drift):
-    """Of at most a twelfth of the friction."""
+def test_drifting_offset_of_a_force_sensor_is_named(drift):
+    """The drift is at most a twelfth of the friction."""
     rate, time = np.array([0.9, 1.7, 3.1]), 0.004 * np.arange(5001)[:, None]
     phase, rng = rate * time, np.random.default_rng(0)
     q, qd, qdd = 0.1 * np.sin(phase), 0.1 * rate * np.cos(phase), -0.1 * rate**2 * np.sin(phase)
@@ -327,9 +328,9 @@ def test_an_offset_of_a_force_sensor_that_drifts_is_named(drift):
     tau += 0.1 * rng.normal(size=q.shape)
     recording = Recording(time[:, 0], q, tau, unit="m")
     motions = [kalman_smoother(recording.time, recording.q)]
-    said = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
-    assert [changed for changed, _ in said] == ["offset"] * (drift != 0)
-    for _, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), [recording], motions, FitOptions()))
+    assert [changed for changed, _ in warned] == ["offset"] * (drift != 0)
+    for _, sentence in warned:
         way, found, within = re.search(
             r"The offset of the force of joint1 (\w+) by (\S+) ± (\S+) N during", sentence
         ).groups()
@@ -337,14 +338,12 @@ def test_an_offset_of_a_force_sensor_that_drifts_is_named(drift):
         assert abs(float(found) - abs(drift)) < float(within) + 0.05 < 0.2
 
 
-# If a friction changes its sign, something else has changed.
+# If friction changes its sign, something else has changed.
 @pytest.mark.parametrize(
     ("change", "rate", "named"), [(0.0, None, False), (0.3, None, True), (0.3, -3.0, False)]
 )
-def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
-    change, rate, named, monkeypatch
-):
-    """With another motion in each."""
+def test_recording_with_different_friction_is_named(change, rate, named, monkeypatch):
+    """Each with another motion."""
 
     def growth(*given):
         found, *others = estimated(*given)
@@ -365,9 +364,9 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
         q = q + 1e-5 * rng.normal(size=q.shape)
         recordings.append(Recording(time[:, 0], q, tau, unit="m", name=f"run{number}"))
     motions = [kalman_smoother(r.time, r.q) for r in recordings]
-    said = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
-    assert len(said) == named
-    for _, sentence in said:
+    warned = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
+    assert len(warned) == named
+    for _, sentence in warned:
         numbers = re.search(r"grows by (\S+) ± (\S+) % in run2 relative to", sentence)
         found, within = map(float, numbers.groups())
         assert abs(found - 30) < within < 5
@@ -375,10 +374,10 @@ def test_a_recording_whose_friction_differs_from_that_of_the_others_is_named(
 
 @pytest.mark.parametrize("chirp", [True, False])
 @pytest.mark.parametrize("mass", [1.0, 1.1])
-def test_another_law_or_mass_or_a_growing_motion_is_no_change_of_friction(chirp, mass):
+def test_wrong_law_or_mass_or_growth_is_no_change_of_friction(chirp, mass):
     plant = PendulumChain(**MOTOR | {"mass": [mass]})
-    said = warnings_of(plant, *warming(0.0, chirp))
-    assert not any("friction of" in w or "loose" in w for w in said)
+    warned = warnings_of(plant, *warming(0.0, chirp))
+    assert not any("friction of" in w or "loose" in w for w in warned)
 
 
 @pytest.mark.parametrize(
@@ -409,13 +408,13 @@ def test_one_short_motion_is_no_evidence_of_a_change_of_friction(pushed, coeffic
     )  # fmt: skip
     tau = tau + 0.01 * np.random.default_rng(seed).normal(size=tau.shape)
     given = PendulumChain(**MOTOR | {"mass": [mass]})
-    said = warnings_of(given, COUNT * np.round(found.q.numpy() / COUNT), tau)
-    assert not any("friction of" in w for w in said)
+    warned = warnings_of(given, COUNT * np.round(found.q.numpy() / COUNT), tau)
+    assert not any("friction of" in w for w in warned)
 
 
 @pytest.mark.slow
-def test_a_mistake_is_named_at_a_high_rate_too():
-    """Few blocks remained of many samples each."""
+def test_mistake_is_named_at_a_high_sample_rate_too():
+    """There were few blocks with many samples each."""
     plant, q, tau = measured("motor", None)
     slow, time = STEP * np.arange(SAMPLES), 5e-5 * np.arange(120_000)
     q, tau = (np.interp(time, slow, x[:, 0])[:, None] for x in (q, tau))
@@ -457,7 +456,7 @@ def test_a_torque_held_for_long_steps_is_no_delay():
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_mistakes_in_positions(name, change, finding):
+def test_mistakes_in_positions_are_named(name, change, finding):
     plant, q, tau = measured(name)
     assert finding in warnings_of(plant, np.ascontiguousarray(change(q)), tau)[0]
 
@@ -475,7 +474,7 @@ def test_mistakes_in_positions(name, change, finding):
         ("driven", lambda tau: np.abs(tau) * [1, 0] + tau * [0, 1], "joint1 is recorded without"),
     ],
 )
-def test_mistakes_in_torques(name, change, finding):
+def test_mistakes_in_torques_are_named(name, change, finding):
     plant, q, tau = measured(name)
     assert finding in warnings_of(plant, q, np.ascontiguousarray(change(tau)))[0]
 
@@ -512,7 +511,7 @@ def test_mistakes_in_torques(name, change, finding):
         ),
     ],
 )
-def test_mistakes_in_rigs(name, rig, finding):
+def test_mistakes_in_rigs_are_named(name, rig, finding):
     _, q, tau = measured(name)
     kind = Rotor if name == "wheel" else PendulumChain
     plant = kind(**{**{"motor": MOTOR, "wheel": WHEEL}.get(name, DOUBLE), **rig})
@@ -531,7 +530,7 @@ def test_torques_without_gravity_are_named(name, remedy):
 
 
 @pytest.mark.parametrize(("name", "stiffness"), [("axis", 40.0), ("wheel", 1.5)])
-def test_a_spring_that_the_rig_lacks_is_named(name, stiffness):
+def test_spring_missing_in_the_rig_is_named(name, stiffness):
     plant, q, tau = measured(name)
     named = warnings_of(plant, q, tau + stiffness * (q - 0.1))[0]
     found = float(re.search(r"joint1 has a spring of (\S+) N", named)[1])
@@ -556,7 +555,7 @@ def test_cogging_is_named(name, rate, share):
 
 
 @pytest.mark.parametrize("inertia", [0.002, 0.02, 2.0])
-def test_rounding_at_a_steady_speed_is_no_mistake(inertia):
+def test_quantisation_at_a_steady_speed_is_no_mistake(inertia):
     """Dry friction and an offset explain a constant torque, so that only noise remains."""
     time, torque = STEP * np.arange(SAMPLES), 0.3
     settling = inertia / 0.02  # From rest, with dry friction of 0.1 and viscous friction of 0.02.
@@ -565,7 +564,7 @@ def test_rounding_at_a_steady_speed_is_no_mistake(inertia):
     assert warnings_of(Rotor(inertia), q, np.full_like(q, torque)) == ()
 
 
-def test_jumps_of_a_torque_are_no_noise_that_would_hide_a_mistake():
+def test_torque_jumps_do_not_hide_a_mistake():
     """At 50 Hz a block has few samples, and a torque that switches differs between them."""
     time, switched = 0.02 * np.arange(1501), np.random.default_rng(0).choice([-3.0, 3.0], 751)
     tau, plant = np.repeat(switched, 2)[:1501, None], Rotor(0.02)
@@ -579,8 +578,8 @@ def test_jumps_of_a_torque_are_no_noise_that_would_hide_a_mistake():
 
 
 @pytest.mark.parametrize(("times", "named"), [(2, "repeated"), (0, "missing")])
-def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
-    """A fit absorbs most of a wrong clock in the inertia, and seems good."""
+def test_rows_lost_or_repeated_with_even_time_stamps_are_named(times, named):
+    """A fit absorbs most of a wrong clock in the inertia, and looks good."""
     plant, q, tau = measured("wheel", 1e-4)
     rows = np.ones(len(q), dtype=int)
     rows[np.random.default_rng(0).choice(len(q), len(q) // 30, replace=False)] = times
@@ -590,7 +589,7 @@ def test_rows_lost_or_repeated_under_even_times_are_named(times, named):
 
 
 def test_stale_positions_are_named():
-    """A sensor slower than the log repeats its last position, with the torque going on."""
+    """A sensor slower than the log repeats its last position while the torque continues."""
     plant, q, tau = measured("wheel", 1e-4)
     rows = np.arange(len(q))
     late = np.random.default_rng(0).choice(len(q) - 1, len(q) // 20, replace=False) + 1
@@ -600,8 +599,8 @@ def test_stale_positions_are_named():
 
 
 @pytest.mark.parametrize("period", [1.0, 10.0])
-def test_an_overflow_that_recurs_or_is_rare_is_named_first(period):
-    """Many jumps look like a lively motion, and a filter makes an elastic joint of them."""
+def test_recurring_or_rare_overflow_is_named_first(period):
+    """Many jumps look like a lively motion, and after filtering like an elastic joint."""
     plant, q, tau = measured("wheel")
     first = warnings_of(plant, 5 * q % period, tau)[0]
     assert "likely: a counter overflows: joint1 of a recording jumps by" in first
@@ -614,7 +613,7 @@ def test_noise_of_a_resting_joint_is_no_overflow():
     assert not any("overflows" in warning for warning in warnings_of(plant, still, tau))
 
 
-def test_wrapped_angles_are_no_elastic_joint():
+def test_wrapped_angles_are_not_taken_for_an_elastic_joint():
     plant, q, tau = measured("wheel")
     with pytest.warns(UserWarning, match="looks wrapped"):
         first = warnings_of(plant, 20 * q % (2 * math.pi), tau)[0]
@@ -628,7 +627,7 @@ def test_an_inertia_that_the_fit_corrects_is_no_mistake():
 
 
 @pytest.mark.parametrize("name", ["free", pytest.param("driven", marks=pytest.mark.slow)])
-def test_mistakes_in_conventions_and_time(name):
+def test_mistakes_in_conventions_and_time_are_named(name):
     plant, q, tau = measured(name)
     assert (
         "angles are relative, not absolute"
@@ -654,17 +653,17 @@ def test_a_wrong_sample_rate_is_named(name):
 
 @pytest.mark.parametrize("rate", [20.0, 500.0, 4000.0, 10000.0])
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_the_unit_of_times_is_that_of_a_usual_rate(rate, unit, factor):
+def test_time_unit_is_chosen_by_usual_sample_rates(rate, unit, factor):
     time = np.arange(100) / rate
     assert time_unit(time) is None
     found = time_unit(factor * time)
-    # Above 2 kHz, ms are too short to be told from s.
+    # Above 2 kHz, milliseconds cannot be distinguished from seconds.
     assert found is None if factor / rate < 0.5 else found[0] == unit
 
 
 @pytest.mark.parametrize("name", ["free", "motor", "axis"])
 @pytest.mark.parametrize(("unit", "rate"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_of_times_in_another_unit_the_unit_alone_is_named(name, unit, rate):
+def test_wrong_time_unit_is_named_alone(name, unit, rate):
     """An inertia or torque that is wrong by the square of the factor would explain as much."""
     plant, q, tau = measured(name)
     with pytest.warns(UserWarning, match="`time` looks like"):
@@ -678,7 +677,7 @@ def test_exchanged_columns_are_named():
     assert "the columns of joint1 and joint2 are exchanged" in warnings_of(plant, *swapped)[0]
 
 
-def test_an_advanced_torque_is_in_line_again():
+def test_advanced_torque_is_aligned_again():
     plant, q, tau = measured("motor")
     late = Recording(STEP * np.arange(len(q)), q, later(tau, 10), convention="relative,upright")
     aligned = late.advance_torque(10 * STEP)
@@ -698,7 +697,7 @@ def test_a_driven_motion_without_torque_is_named(name):
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_a_swing_that_gains_little_energy_is_named(backwards):
-    """The balance of torques is too coarse for weak friction; a fit is not."""
+    """The torque balance is too coarse for weak friction; a fit is not."""
     swung = swing(pendulum(), CVFM(2, [[1e-3, 2e-4], [4e-4, 1e-4]]).requires_grad_(False))
     q = np.pi / 1024 * np.round(swung.q * 1024 / np.pi)
     recording = Recording(swung.time, q[::-1] if backwards else q, convention=swung.convention)
@@ -709,7 +708,7 @@ def test_a_swing_that_gains_little_energy_is_named(backwards):
 
 
 def of_motor(plant: Plant, tau: np.ndarray) -> np.ndarray:
-    """Positions of a motor under these torques, as its encoder gives them."""
+    """Positions of a motor with these torques, as given by its encoder."""
     start = torch.tensor([math.pi], dtype=torch.float64)
     model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
     found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
@@ -719,7 +718,7 @@ def of_motor(plant: Plant, tau: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("off", [slice(SAMPLES // 2, None), slice(SAMPLES // 3, 2 * SAMPLES // 3)])
 def test_a_drive_that_is_off_for_a_while_is_named(off):
-    """An emergency stop, for example, after which the log holds the command."""
+    """An emergency stop, for example, after which the log contains the command."""
     plant, _, commanded = measured("motor")
     driven = commanded.copy()
     driven[off] = 0.0
@@ -727,8 +726,8 @@ def test_a_drive_that_is_off_for_a_while_is_named(off):
     assert warnings_of(plant, q, driven) == ()
     (warning,) = warnings_of(plant, q, commanded)
     first = STEP * off.start
-    said = float(re.search(r"the drive of joint1 is off from ([\d.]+) to ", warning)[1])
-    assert said == pytest.approx(first, abs=0.2)
+    lower = float(re.search(r"the drive of joint1 is off from ([\d.]+) to ", warning)[1])
+    assert lower == pytest.approx(first, abs=0.2)
     assert "although a torque is recorded (set it to 0)" in warning
 
 
@@ -759,10 +758,10 @@ def test_end_stops_are_named(stop, effort, ends):
     assert [re.findall(r"(\S+) rad \(at", text) for text in found] == ([ends] if ends else [])
 
 
-def test_a_drive_that_saturates_is_named():
+def test_saturating_drive_is_named():
     plant, q, tau = measured("motor")
     most = np.abs(tau).max()
-    # The log holds what was commanded, in which the limit does not show.
+    # The log contains the command, which does not show the limit.
     commanded = np.sign(tau) * np.where(np.abs(tau) > 0.6 * most, 2 * np.abs(tau) - 0.6 * most,
                                         np.abs(tau))  # fmt: skip
     driven = np.clip(commanded, -0.6 * most, 0.6 * most)
@@ -773,7 +772,7 @@ def test_a_drive_that_saturates_is_named():
 
 
 @pytest.mark.parametrize("drift", [0.01, -0.01])
-def test_a_clock_that_drifts_is_named(drift):
+def test_drifting_clock_is_named(drift):
     plant, q, tau = measured("motor")
     time = STEP * np.arange(len(q))
     late = np.interp(time * (1 - drift), time, tau[:, 0])[:, None]
@@ -784,8 +783,8 @@ def test_a_clock_that_drifts_is_named(drift):
 
 
 @pytest.mark.parametrize("name", ["wheel", pytest.param("driven", marks=pytest.mark.slow)])
-def test_torques_held_for_a_sample_are_no_mistake(name):
-    """Half a sample late throughout, as a little drift or inertia would have it."""
+def test_zero_order_hold_of_torques_is_no_mistake(name):
+    """Half a sample late throughout, which resembles a small drift or inertia error."""
     plant, _, tau = measured(name)
     joints, step, samples = plant.joints, 1e-2, 2000
     time = step * np.arange(samples)
@@ -798,8 +797,8 @@ def test_torques_held_for_a_sample_are_no_mistake(name):
     assert warnings_of(plant, found.q.numpy(), waves, time=time) == ()
 
 
-def test_an_elastic_joint_is_named_and_doubtful():
-    """A drive of half the inertia, a spring, and a link whose encoder is read."""
+def test_fit_with_an_elastic_joint_is_doubtful_and_names_it():
+    """A drive with half the inertia, a spring, and a link whose encoder is read."""
     plant, _, tau = measured("direct")
     drive, link, stiffness = 0.04, 0.04, 80.0
     weight = float(plant.gravity_moment.sum())
@@ -808,7 +807,7 @@ def test_an_elastic_joint_is_named_and_doubtful():
     for u in tau[:, 0]:
         seen.append(state[1])
         for _ in range(steps):
-            # Semi-implicit: a spring without damping neither gains nor loses.
+            # Semi-implicit Euler: an undamped spring neither gains nor loses energy.
             spring = stiffness * (state[0] - state[1]) + 0.05 * (state[2] - state[3])
             rub = 0.3 * np.tanh(state[2] / 3e-3) + 0.12 * state[2]
             state[2] += h * (u - rub - spring) / drive
@@ -821,7 +820,7 @@ def test_an_elastic_joint_is_named_and_doubtful():
     resonance = math.sqrt(stiffness * (1 / drive + 1 / link)) / math.tau
     (named,) = re.findall(r"resonance near ([\d.]+) Hz", found.mistakes[0])
     assert float(named) == pytest.approx(resonance, rel=0.15)
-    # Simulations follow the motion all the same.
+    # Simulations still follow the motion.
     assert found.usability[0] == "doubtful"
     assert replace(found, converged=False).usability[0] == "do not use"
 
@@ -859,7 +858,7 @@ def test_a_recording_of_another_rig_is_named(zero):
 
 
 @pytest.mark.parametrize("factor", [3.0, 0.3])
-def test_friction_that_changes_between_recordings_is_of_no_other_rig(factor):
+def test_friction_change_between_recordings_is_not_another_rig(factor):
     plant = measured("motor")[0]
     recordings = of_several_days(plant, [0.3 * factor, 0.12 * factor])
     for given in (recordings, recordings[1:]):
@@ -869,7 +868,7 @@ def test_friction_that_changes_between_recordings_is_of_no_other_rig(factor):
 
 
 @pytest.mark.parametrize("factor", [3.0, 1.0, 0.25])
-def test_friction_that_differs_between_free_swings_is_named_and_of_no_other_rig(factor):
+def test_friction_change_between_swings_is_named_not_another_rig(factor):
     plant, friction = pendulum(), np.array([[0.01, 4e-3], [4e-3, 2e-3]])
     models = [CVFM(2, f * friction, v_smooth=0.01) for f in (1.0, factor)]
     starts = (1.6, 0.8), (1.2, 1.0)
@@ -882,10 +881,10 @@ def test_friction_that_differs_between_free_swings_is_named_and_of_no_other_rig(
     assert_drift(task.drift, dict.fromkeys(plant.joint_names if factor != 1 else (), factor))
 
 
-def assert_drift(said: tuple[str, ...], factors: dict[str, float]) -> None:
-    """The friction of these joints changes by these factors, and of no others."""
-    assert len(said) == len(factors)
-    for sentence, (joint, factor) in zip(said, factors.items(), strict=True):
+def assert_drift(warned: tuple[str, ...], factors: dict[str, float]) -> None:
+    """Assert that the friction of only these joints changes, by these factors."""
+    assert len(warned) == len(factors)
+    for sentence, (joint, factor) in zip(warned, factors.items(), strict=True):
         way, found, within = re.match(
             rf"The friction of {joint} (grows|falls) by (\S+) ± (\S+) % "
             "(?:.* to the last|in other)",
@@ -896,7 +895,7 @@ def assert_drift(said: tuple[str, ...], factors: dict[str, float]) -> None:
         assert abs(float(found) - 100 * abs(factor - 1)) < float(within) + 20
 
 
-def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
+def test_recordings_zeroed_in_different_poses_are_of_one_rig():
     made = [zeroed_in_a_pose(np.array(zero)) for zero in ((0.02, -0.03), (-0.01, 0.02))]
     plant, recordings = made[0][0], [recording for *_, recording in made]
     task = prepare_task(CVFM(2), plant, recordings, FitOptions())
@@ -907,8 +906,8 @@ def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
 
 
 @pytest.mark.parametrize("degrees", [(3.0, 0.0), (0.0, 3.0), (0.0, 0.0)])
-def test_an_encoder_that_was_homed_anew_is_named(degrees):
-    """Also if friction is most of the torque, so that the correction explains less than half."""
+def test_encoder_homed_again_is_named(degrees):
+    """Also if friction dominates the torque, so that the correction explains less than half."""
     plant = PendulumChain(**DOUBLE)
     model = CVFM(2, [[0.02, 0.004], [0.008, 0.003]], v_smooth=0.01).requires_grad_(False)
     starts = (1.2, -0.5), (0.9, 0.7)
@@ -921,7 +920,7 @@ def test_an_encoder_that_was_homed_anew_is_named(degrees):
     for found, joint in zip(task.mistakes, joints, strict=True):
         assert re.match(rf"encoder zeros differ: {joint} by (2\.9|3|3\.1) degrees", found)
         assert "and after (`encoder_reference" in found
-    # A recording too short to be looked at does not shift the names; the option needs this method.
+    # A recording too short for the test does not shift the names; the option needs this method.
     short = recordings[0][: round(0.1 / recordings[0].sample_time)]._replace(name="short")
     for given in ([recordings[0], short, recordings[1]], [short, *recordings]):
         options = FitOptions(method="equation_error")
@@ -930,7 +929,7 @@ def test_an_encoder_that_was_homed_anew_is_named(degrees):
             assert found.endswith('(`method="output_error"`, `encoder_reference="per_recording"`)')
 
 
-def test_another_offset_of_a_drive_may_look_like_another_zero():
+def test_drive_offset_may_look_like_an_encoder_offset():
     plant, q, tau = measured("motor")
     halves = []
     for part, offset in ((slice(SAMPLES // 2), 0.0), (slice(SAMPLES // 2, None), 0.3)):
@@ -946,7 +945,7 @@ def test_another_offset_of_a_drive_may_look_like_another_zero():
 @pytest.mark.parametrize("rounded", [True, False])
 def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")
-    # Without visible counts, too.
+    # Also without visible counts.
     q = q.copy() if rounded else kalman_smoother(STEP * np.arange(len(q)), q).q.copy()
     q[1000, 1] += 0.5
     (found,) = (w for w in warnings_of(plant, q, tau) if "one sample" in w)
@@ -961,12 +960,12 @@ def test_lost_counts_and_missing_samples_are_named_with_their_time():
     kept = np.r_[0:1000, 1030 : len(q)]
     found = warnings_of(plant, q[kept], tau[kept], time=STEP * np.arange(len(kept)))
     assert any("jumps for good at 2 s:" in warning for warning in found)
-    # Positions that jump look like friction that changes.
+    # Jumps in position look like friction that changes.
     assert not any("friction of" in warning for warning in found)
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
-def test_a_counter_that_overflows_is_named():
+def test_counter_overflow_is_named():
     plant, q, tau = measured("driven")
     wrapped = (q + 0.1) % 0.7
     (found, *_) = (w for w in warnings_of(plant, wrapped, tau) if "good" in w)
@@ -974,8 +973,8 @@ def test_a_counter_that_overflows_is_named():
 
 
 @pytest.mark.parametrize("name", ["direct", pytest.param("motor", marks=pytest.mark.slow)])
-def test_torques_of_a_wrong_scale_are_named(name):
-    """They fit a rig that is heavier throughout, within what is allowed; with a gear, too."""
+def test_wrongly_scaled_torques_are_named(name):
+    """They fit a rig that is heavier throughout, within the allowed range; also with a gear."""
     plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(0.5,))
@@ -985,15 +984,15 @@ def test_torques_of_a_wrong_scale_are_named(name):
 @pytest.mark.parametrize(
     ("scale", "inertia", "named"), [(1.15, 1.06, True), (1.0, 1.08, False), (1.0, 1.25, False)]
 )
-def test_a_scale_of_the_torques_is_named_although_the_rig_errs(scale, inertia, named):
-    """Only a common change of inertia and gravity beyond that of the usual rig."""
+def test_torque_scale_is_named_despite_errors_of_the_rig(scale, inertia, named):
+    """Only a common change of inertia and gravity beyond that of usual rig errors."""
     plant, q, tau = measured("direct")
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
     wrong = plant.replace(inertia_coupling=plant.inertia_coupling / inertia)
     found = fit(CVFM(1), wrong, recording, windows=(0.5,))
-    said = [w for w in found.warnings if "torques are recorded" in w]
-    assert len(said) == named
-    for text in said:
+    warned = [w for w in found.warnings if "torques are recorded" in w]
+    assert len(warned) == named
+    for text in warned:
         assert re.search(r"are on average 1\.1[78]\d* times those of the rig", text)
         assert found.usability[0] == "doubtful"
 
@@ -1006,15 +1005,15 @@ def test_a_step_at_a_gap_is_no_spike():
     assert not any("jumps" in warning for warning in found)
 
 
-def test_time_stamps_that_jitter_are_no_jump():
-    """Samples are taken on time, and stamped late; scaled by the stamps, fast steps differ."""
+def test_time_stamp_jitter_is_no_jump():
+    """Samples are taken on time and stamped late; scaled by the stamps, fast steps differ."""
     plant, q, tau = measured("wheel", count=COUNT / 50)
     late = np.abs(np.random.default_rng(0).normal(scale=0.1 * STEP, size=len(q)))
     found = warnings_of(plant, q, tau, time=STEP * np.arange(len(q)) + late)
     assert not any("jumps" in warning for warning in found)
 
 
-def test_a_sample_that_is_stamped_late_is_no_jump():
+def test_sample_stamped_late_is_no_jump():
     """Its step seems slow, and the next one fast."""
     plant, q, tau = measured("wheel", count=COUNT / 50)
     time = STEP * np.arange(len(q))
@@ -1027,7 +1026,7 @@ def test_a_sample_that_is_stamped_late_is_no_jump():
 
 
 @pytest.mark.parametrize("missing", [1, 3])
-def test_samples_missing_with_their_times_are_no_jump(missing):
+def test_samples_missing_with_their_time_stamps_are_no_jump(missing):
     plant, q, tau = measured("wheel", count=COUNT / 50)
     kept = np.r_[0:1000, 1000 + missing : len(q)]
     found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
@@ -1045,7 +1044,7 @@ def test_a_fit_names_the_mistake_first(caplog):
     assert "the sign of joint1's position is reversed" in found.usability[1]
 
 
-def test_a_fit_says_whether_it_is_usable():
+def test_fit_states_whether_it_is_usable():
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
     settings = {"windows": (1.0,), "fit_plant": False}
@@ -1055,10 +1054,10 @@ def test_a_fit_says_whether_it_is_usable():
     verdict, reason = wrong.usability
     assert verdict == "doubtful"
     assert "times the measurement noise" in reason
-    # Turns in plenty excuse no error of the angle.
+    # Many turns do not excuse an angle error.
     turning = tuple(replace(m, q=50 * m.q) for m in wrong.motions)
     assert replace(wrong, motions=turning).usability[0] == "doubtful"
-    # Without gravity all angles are alike, and a wheel that turns often has moved far.
+    # Without gravity all angles are equivalent, and a wheel that turns often has moved far.
     assert replace(wrong, motions=turning, plant=Rotor(0.01)).usability[0] == "good"
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
@@ -1070,11 +1069,11 @@ def test_a_fit_says_whether_it_is_usable():
 
 
 @pytest.mark.filterwarnings("ignore:.*looks like degrees")
-def test_a_wheel_that_coasts_far_excuses_no_law():
+def test_long_coasting_does_not_excuse_a_wrong_law():
     """Most of its motion needs no torque, so even a wrong friction law follows it."""
     time, speed = np.arange(2001) * 1e-2, [30.0]
     for _ in range(10 * (len(time) - 1)):
-        # Dry friction, and drag of air in proportion to the square of the speed.
+        # Dry friction, and air drag proportional to the square of the speed.
         slowed = speed[-1] - 1e-3 / 0.08 * (0.06 + 4e-4 * speed[-1] ** 2)
         speed.append(max(0.0, slowed))
     angle = 1e-3 * (np.cumsum(speed) - np.array(speed) / 2)[::10]
@@ -1087,24 +1086,24 @@ def test_a_wheel_that_coasts_far_excuses_no_law():
 
 
 @pytest.mark.parametrize("scale", [0.93, 1.0, 1.08])
-def test_a_torque_constant_within_its_tolerance_is_named_if_friction_leaves_its_interval(scale):
+def test_torque_constant_is_named_if_friction_leaves_its_interval(scale):
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(1.0,))
-    told = [warning for warning in found.warnings if "torque constant" in warning]
-    assert len(told) == (scale != 1.0)
-    for warning in told:
+    warned = [warning for warning in found.warnings if "torque constant" in warning]
+    assert len(warned) == (scale != 1.0)
+    for warning in warned:
         assert f"recorded {scale} times as large as they are" in warning
 
 
 @pytest.mark.slow
-def test_noise_of_the_torque_is_no_error_of_the_law():
+def test_torque_noise_is_no_error_of_the_law():
     plant, fine, tau = measured("wheel", COUNT / 16)
     noisy = tau + 0.05 * np.random.default_rng(0).standard_normal(tau.shape)
     recording = Recording(STEP * np.arange(len(fine)), fine, noisy)
     settings = {"windows": (2.0,), "fit_plant": False}
     right = fit(CVFM(1), plant, recording, **settings)
-    # Far above the rounding, and just what the noise of the torque explains.
+    # Far above quantisation, and just what the torque noise explains.
     assert right.residual > 50 * (COUNT / 16) / 12**0.5
     assert right.residual == pytest.approx(right.noise, rel=0.5)
     assert right.usability == ("good", "")
@@ -1113,10 +1112,10 @@ def test_noise_of_the_torque_is_no_error_of_the_law():
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(0.15, "good"), (0.3, "doubtful")])
-def test_a_fine_encoder_calls_no_small_error_doubtful(factor, verdict):
-    """An error of the law is judged by the motion, however fine the encoder is."""
+def test_small_error_is_not_doubtful_with_a_fine_encoder(factor, verdict):
+    """An error of the law is judged relative to the motion, however fine the encoder is."""
     plant, fine, tau = measured("wheel", COUNT / 1024)
-    # A driver whose gain grows with its torque, which no term of the plant is.
+    # A driver whose gain grows with its torque, an effect that no plant term has.
     recording = Recording(STEP * np.arange(len(fine)), fine, np.sinh(factor * tau) / factor)
     found = fit(CVFM(1), plant, recording, windows=(1.0,), fit_plant=False)
     assert found.residual > 30 * found.noise
@@ -1124,7 +1123,7 @@ def test_a_fine_encoder_calls_no_small_error_doubtful(factor, verdict):
 
 
 @pytest.mark.slow
-def test_an_encoder_without_visible_count_excuses_no_law():
+def test_encoder_without_visible_count_does_not_excuse_a_wrong_law():
     plant, smooth, tau = measured("wheel", None)
     recording = Recording(STEP * np.arange(len(smooth)), smooth, tau)
     settings = {"windows": (1.0,), "fit_plant": False}
@@ -1133,7 +1132,7 @@ def test_an_encoder_without_visible_count_excuses_no_law():
 
 
 @pytest.mark.parametrize("every", [SAMPLES, 100])
-def test_a_spike_of_the_torque_is_named_with_its_time(every):
+def test_torque_spike_is_named_with_its_time(every):
     """Also if so many samples are spikes that they raise the quantiles of the curvature."""
     plant, q, tau = measured("driven")
     tau = tau.copy()
@@ -1172,14 +1171,14 @@ def pushed(q: float, friction: float, weight: float, seed: int) -> Recording:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_joint_that_friction_holds_has_no_drive_that_is_off(seed):
+def test_joint_held_by_friction_is_not_taken_for_a_drive_that_is_off(seed):
     """Noise of a velocity near zero has a direction, too, for tenths of a second."""
     rig = PendulumChain([0.5], [0.3], com=[0.204], inertia=[0.0592])
     recording = pushed(0.0, 0.6, 0.5 * 9.81 * 0.204, seed)
     assert prepare_task("CVFM", rig, recording, FitOptions()).mistakes == ()
 
 
-def test_presliding_is_not_named_a_spring():
+def test_presliding_is_not_taken_for_a_spring():
     plant, q, tau = measured("wheel")
     recording = Recording(STEP * np.arange(len(q)), q, tau + 1.5 * q)
     (spring,) = prepare_task("CVFM", plant, recording, FitOptions()).mistakes[:1]
@@ -1189,7 +1188,7 @@ def test_presliding_is_not_named_a_spring():
 
 
 @pytest.mark.parametrize(("inertia", "verdict"), [(0.95, None), (0.85, "good"), (0.79, "doubtful")])
-def test_a_free_rig_that_disagrees_with_its_motion_is_named(inertia, verdict):
+def test_undriven_rig_that_disagrees_with_its_motion_is_named(inertia, verdict):
     model = CVFM(1, [[8e-3, 2e-3]], v_smooth=0.01)
     plant = PendulumChain([0.5], [0.4], inertia=[0.0])
     recording = swing(plant, model, seconds=4.0, start=(2.2,))
@@ -1205,7 +1204,7 @@ def test_a_free_rig_that_disagrees_with_its_motion_is_named(inertia, verdict):
 
 @pytest.mark.parametrize(("scale", "verdict"), [(0.95, None), (0.85, "good"), (0.72, "doubtful")])
 @pytest.mark.parametrize("name", ["wheel", "axis"])
-def test_a_torque_that_scales_a_single_inertia_is_named(name, scale, verdict):
+def test_torque_scale_of_a_single_inertia_is_named(name, scale, verdict):
     plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, unit=plant.unit)
     found = fit(CVFM(1), plant, recording, windows=(1.0,))
@@ -1216,7 +1215,7 @@ def test_a_torque_that_scales_a_single_inertia_is_named(name, scale, verdict):
         assert found.usability[0] == verdict
 
 
-def test_a_fit_that_determines_no_friction_is_not_to_be_used():
+def test_fit_that_determines_no_friction_is_unusable():
     plant, q, tau = measured("wheel")
     recording = Recording(STEP * np.arange(len(q)), q, tau)
     found = fit(CVFM(1), plant, recording, method="equation_error")
@@ -1229,7 +1228,7 @@ def test_a_fit_that_determines_no_friction_is_not_to_be_used():
 
 @pytest.mark.parametrize("method", ["equation_error", "output_error"])
 @pytest.mark.parametrize("weight", [5.0, -98.0])
-def test_a_weight_that_the_rig_lacks_takes_no_friction(method, weight):
+def test_weight_missing_in_the_rig_does_not_bias_friction(method, weight):
     plant, q, tau = measured("axis")
     level = Recording(STEP * np.arange(len(q)), q, tau, unit="m")
     recording = replace(level, tau=tau + weight)
@@ -1243,14 +1242,14 @@ def test_a_weight_that_the_rig_lacks_takes_no_friction(method, weight):
         values = one.model.schedule.values, expected.schedule.values
         torch.testing.assert_close(*values, rtol=2e-3, atol=0)
         assert float(one.plant.torque_offset) == pytest.approx(-weight, rel=5e-3)
-        (told,) = (w for w in one.warnings if "constant drive force" in w)
-        assert f"add {weight:.2g}"[:6] in told
-        assert "but not if it is a sensor's bias" in told
+        (warning,) = (w for w in one.warnings if "constant drive force" in w)
+        assert f"add {weight:.2g}"[:6] in warning
+        assert "but not if it is a sensor's bias" in warning
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_in_one_direction_no_offset_takes_the_place_of_friction(seed):
-    """Nor for a joint that rests."""
+def test_offset_does_not_replace_friction_in_one_direction(seed):
+    """Nor for a joint at rest."""
     plant = Rotor(**WHEEL)
     tau = 0.25 * torque([3.0], seed) + 1.5
     zero = torch.zeros(1, dtype=torch.float64)
@@ -1261,7 +1260,7 @@ def test_in_one_direction_no_offset_takes_the_place_of_friction(seed):
     found = fit("CVFM", plant, recording, method="equation_error")
     assert float(found.model.schedule.values[0, 0]) == pytest.approx(0.3, rel=0.02)
     assert not found.plant.torque_offset.any()
-    # Stiction, of which the smoothed sign is as steep as before.
+    # Stiction, for which the smoothed sign is as steep as before.
     resting = replace(recording, q=0 * recording.q + 0.1, tau=0.1 + 0 * tau)
     still = fit("CVFM", plant, resting, method="equation_error")
     assert not still.plant.torque_offset.any()
@@ -1285,7 +1284,7 @@ def test_rows_stamped_in_batches_are_refused():
         fit(CVFM(1), plant, recording)
 
 
-def test_a_torque_sensor_that_is_clipped_or_stuck_is_named():
+def test_clipped_or_stuck_torque_sensor_is_named():
     plant, q, tau = measured("wheel")
 
     def named(torque: np.ndarray) -> list[str]:
@@ -1298,7 +1297,7 @@ def test_a_torque_sensor_that_is_clipped_or_stuck_is_named():
     stuck[1000:1400] = stuck[1000]
     (held,) = named(stuck)
     assert "13 % of the samples, from 2 s:" in held
-    # A coarse sensor, a slower bus, a drive that is off, and a limited command are sound.
+    # A coarse sensor, a slower bus, a drive that is off, and a limited command are valid.
     off = noisy.copy()
     off[1000:1400] = 0.0
     for sound in (noisy, 0.05 * np.round(noisy / 0.05), np.repeat(noisy[::5], 5, 0)[: len(q)], off,

@@ -1,4 +1,4 @@
-"""Geared mechanisms that torques drive, read at irregular times, and what a law expects of them."""
+"""Geared, driven mechanisms with irregular time stamps, and the priors of a law."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ DRY = [[0.20, 0.010], [0.15, 0.005]]
 
 
 def geared() -> PendulumChain:
-    """A double pendulum as heavy, and with rotors as large, as quasi-direct drives have."""
+    """A double pendulum with the masses and rotor inertias of quasi-direct drives."""
     return PendulumChain(
         [0.5, 0.6], [0.2, 0.3], inertia=[8e-3, 9e-3], armature=[3e-3, 3e-3],
         convention=("relative", "hanging"),
@@ -32,7 +32,7 @@ def geared() -> PendulumChain:
 def driven(
     plant: PendulumChain, model: FrictionModel, seed: int, seconds: float = 3.0, late: int = 0
 ) -> Recording:
-    """Sums of sines in torque from rest, stamped as a host's clock does: late now and then.
+    """Sums of sines in torque from rest, with a host's time stamps, which are occasionally late.
 
     The torque acts `late` samples after it is logged.
     """
@@ -53,16 +53,16 @@ def driven(
 
 
 @pytest.mark.slow
-def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_stamps():
+def test_friction_and_masses_are_recovered_from_irregular_stamps():
     plant = geared()
     recordings = [driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), seed) for seed in (0, 1)]
     given = plant.replace(armature=plant.armature * 0.9, gravity_moment=1.05 * plant.gravity_moment)
     found = fit(CVFM(2, v_smooth=V_SMOOTH), given, recordings, windows=(1.0,))
     assert found.converged, found.status
     truth = torch.tensor(DRY, dtype=F64)
-    # An encoder of 16384 counts leaves some thousandths open.
+    # An encoder of 16384 counts leaves an uncertainty of some thousandths.
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.01, atol=1e-4)
-    # The first rotor turns with the first link, so only their sum can be told.
+    # The first rotor turns with the first link, so only their sum is identifiable.
     pose = torch.tensor([[0.0, 0.0], [1.0, 2.0]], dtype=F64)
     for term in ("mass_matrix", "gravity"):
         torch.testing.assert_close(
@@ -70,7 +70,7 @@ def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_
         )
 
 
-def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
+def test_drive_gain_below_one_is_recovered():
     plant = geared()
     truth = plant.replace(torque_gain=torch.tensor([1.0, 0.85], dtype=F64))
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
@@ -80,13 +80,13 @@ def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
     (gain,) = (i for i in found.intervals if i.name == "torque gain 2")
     assert gain.low < -0.15 < gain.high
     assert gain.high - gain.low < 0.02
-    # Friction is told in the torques that the drive reports.
+    # Friction is expressed in the torques that the drive reports.
     torch.testing.assert_close(
         found.model.schedule.values, law.schedule.values, rtol=0.02, atol=2e-4
     )
 
 
-def test_friction_that_is_larger_one_way_is_named_as_a_constant_torque():
+def test_direction_dependent_friction_is_named_as_a_constant_torque():
     plant, one_way = geared(), [[0.0, 0.2, 0.01, 0.0, 1.0], [0.03, 0.15, 0.005, 0.0, 1.0]]
     recordings = [driven(plant, NLFM(2, one_way, v_smooth=V_SMOOTH), seed) for seed in (0, 1)]
     found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
@@ -96,22 +96,22 @@ def test_friction_that_is_larger_one_way_is_named_as_a_constant_torque():
     assert "add 0.03 N m to a command" in warning
 
 
-def test_what_gears_lose_is_told_from_dry_friction():
+def test_gear_losses_are_separated_from_dry_friction():
     plant = geared()
     truth = plant.replace(gear_loss=torch.tensor([0.05, 0.12], dtype=F64))
     law = CFM(2, [[0.20], [0.15]], v_smooth=V_SMOOTH)
     recordings = [driven(truth, law, seed) for seed in (0, 1, 2)]
     found = fit(CFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
-    told = {i.name: i for i in found.intervals}
+    intervals = {i.name: i for i in found.intervals}
     for name, loss in (("gear loss 1", 0.05), ("gear loss 2", 0.12)):
-        assert told[name].low < loss < told[name].high, told[name]
-        assert told[name].high - told[name].low < 0.05
+        assert intervals[name].low < loss < intervals[name].high, intervals[name]
+        assert intervals[name].high - intervals[name].low < 0.05
     torch.testing.assert_close(found.model.schedule.values, law.schedule.values, rtol=0.02, atol=0)
 
 
 @pytest.mark.slow
-def test_encoders_zeroed_anew_at_the_start_of_each_recording():
-    """Only the truth's zeros differ; a plant with one offset for all cannot follow."""
+def test_encoders_may_be_zeroed_at_the_start_of_each_recording():
+    """Only the true model's offsets differ; a plant with one offset for all cannot follow."""
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     off = ([0.06, -0.08], [-0.03, 0.05])
@@ -134,8 +134,8 @@ def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     assert torch.equal(each.plant.angle_offset, plant.angle_offset)
 
 
-def test_a_block_left_out_has_the_zero_of_its_recording():
-    """Two thirds of a recording, the last and the first, tell where its encoders read zero."""
+def test_hold_out_block_has_the_encoder_offset_of_its_recording():
+    """The encoder offsets follow from the last and the first third of a recording."""
     plant = geared()
     truth, off = CVFM(2, DRY, v_smooth=V_SMOOTH), ([0.06, -0.08], [-0.03, 0.05])
     recordings = [driven(plant, truth, seed) for seed in (0, 1)]
@@ -153,7 +153,7 @@ def test_a_block_left_out_has_the_zero_of_its_recording():
 
 
 @pytest.mark.slow
-def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
+def test_recordings_starting_at_rest_at_zero_are_taken_as_zeroed_there():
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
@@ -182,7 +182,7 @@ def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
 
 
 @pytest.mark.slow
-def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
+def test_initial_velocity_is_zero_if_zeroed_at_rest():
     """A law with too smooth a sign lets the links creep away; a free start would hide it."""
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
@@ -191,13 +191,13 @@ def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
         found = fit(CVFM(2, v_smooth=0.5), plant, recording, windows=(0.5, 1.0),
                     encoder_reference=reference)  # fmt: skip
         starts[reference] = float(found.residuals[0, 0].abs().max())
-    # Within a step of the encoder where it is held, and far from it where it is not.
+    # Within one encoder count of its pose if it is held, and far from it if not.
     assert starts["per_recording"] < 4e-4 < starts["shared"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [ACVFM, NFCVFM])
-def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind):
+def test_motion_dependent_models_use_the_encoder_offsets_of_their_law(kind):
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     off = ([0.06, -0.08], [-0.03, 0.05])
@@ -215,7 +215,7 @@ def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind
 
 
 @pytest.mark.slow
-def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
+def test_encoder_offsets_of_other_recordings_are_fitted_again():
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
@@ -229,7 +229,7 @@ def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
     assert not np.allclose(turned.encoder_offsets, start.encoder_offsets, atol=1e-6)
 
 
-def test_zeroed_is_refused_where_it_means_nothing():
+def test_encoder_reference_without_meaning_is_refused():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
     with pytest.raises(ValueError, match="`encoder_reference` must be one of"):
@@ -239,7 +239,7 @@ def test_zeroed_is_refused_where_it_means_nothing():
 
 
 @pytest.mark.slow
-def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():
+def test_load_dependent_friction_explains_geared_mechanisms_less_well():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
     plain, loaded = (
@@ -250,18 +250,18 @@ def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained()
 
 
 @pytest.mark.slow
-def test_an_offset_that_the_law_does_not_expect_is_found_where_the_recording_tells_it():
+def test_informative_recording_overrides_the_prior_of_an_offset():
     plant, offset = pendulum(), 4e-4
     truth = NLFM(2, [[offset, 2e-3, 1e-3, 0.0, 1.0]] * 2, v_smooth=V_SMOOTH)
     recording = swing(plant, truth, seconds=1.5)
-    told, denied = (fitted_offset(plant, truth, recording, share) for share in (None, 1e-6))
-    # A recording counts for many times what the law expects, unless that is next to certainty.
-    assert (told - offset).abs().max() < 0.05 * offset
+    fitted, denied = (fitted_offset(plant, truth, recording, share) for share in (None, 1e-6))
+    # A recording counts for many times the prior, unless that is almost certain.
+    assert (fitted - offset).abs().max() < 0.05 * offset
     assert denied.abs().max() < 0.05 * offset
 
 
 def fitted_offset(plant, truth, recording, share):
-    """The offset of a fit, expected to be within a share of the friction."""
+    """The fitted offset, with a prior within a share of the friction."""
     law = truth.law
     if share is not None:
         expected = tuple(replace(c, prior_scale=share) if c.name == "f_o" else c
@@ -273,7 +273,7 @@ def fitted_offset(plant, truth, recording, share):
 
 
 @pytest.mark.parametrize("bare", [True, False])
-def test_a_rotor_inertia_that_the_rig_lacks_is_named_where_it_bends_other_terms(bare):
+def test_missing_rotor_inertia_is_named_if_it_biases_other_terms(bare):
     truth = geared().replace(armature=torch.tensor([0.03, 0.03], dtype=F64))
     given = geared().replace(armature=(0.0 if bare else 0.9) * truth.armature)
     recording = driven(truth, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
@@ -282,7 +282,7 @@ def test_a_rotor_inertia_that_the_rig_lacks_is_named_where_it_bends_other_terms(
 
 
 @pytest.mark.parametrize("motor", [None, Motor(50), Motor(50, rotor_inertia=1.2e-5)])
-def test_the_rotor_of_a_wheels_motor_counts_as_one(motor):
+def test_rotor_inertia_of_a_wheels_motor_is_added(motor):
     """A `Rotor` adds it to its single inertia."""
     jacobian = SimpleNamespace(plant=Rotor(0.02, motor=motor))
     problem = SimpleNamespace(windows=SimpleNamespace(tau=torch.ones(1)), jacobian=jacobian)
@@ -290,7 +290,7 @@ def test_the_rotor_of_a_wheels_motor_counts_as_one(motor):
     assert (rotor_warning(problem, (), ("inertia 11",)) == ()) == has_rotor
 
 
-def test_a_delay_is_found_where_encoders_were_zeroed_at_rest():
+def test_delay_is_recovered_with_encoders_zeroed_at_rest():
     """At first nothing acts, although torques are logged."""
     plant, law = geared(), CVFM(2, [[0.05, 0.010], [0.03, 0.005]], v_smooth=V_SMOOTH)
     early = [driven(plant, law, seed, seconds=2.0, late=4) for seed in (0, 1)]

@@ -1,4 +1,4 @@
-"""Eccentric encoders are fitted where a recording tells of them, and only there."""
+"""Encoder eccentricity is fitted only if a recording contains information about it."""
 
 import pytest
 import torch
@@ -28,31 +28,31 @@ def encoder_terms(found):
 
 
 @pytest.mark.slow
-def test_eccentricity_is_found_and_measured():
+def test_eccentricity_is_detected_and_recovered():
     found = fit(model(), pendulum(), recorded(3e-3), **SETTINGS)
-    told = encoder_terms(found)
+    terms = encoder_terms(found)
     expected = {
         "encoder cosine 1 [rad]": 3e-3, "encoder sine 1 [rad]": -3e-3,
         "encoder cosine 2 [rad]": -3e-3, "encoder sine 2 [rad]": 1.5e-3,
     }  # fmt: skip
-    assert told.keys() == expected.keys()
+    assert terms.keys() == expected.keys()
     intervals = {i.name: i for i in found.intervals}
     for name, value in expected.items():
         # Twice the half-width: four intervals of 95 % each.
         half = (intervals[name].high - intervals[name].low) / 2
-        assert abs(told[name] - value) < 2 * half + 1e-4
-    # What starts from a fit that found them has them too.
+        assert abs(terms[name] - value) < 2 * half + 1e-4
+    # A fit that starts from one with these terms has them too.
     again = fit(model(), pendulum(), recorded(3e-3), start=found, **SETTINGS)
     assert encoder_terms(again).keys() == expected.keys()
 
 
 @pytest.mark.slow
-def test_encoders_that_are_centred_stay_so():
+def test_centred_encoders_get_no_eccentricity():
     recording = recorded(0.0)
     assert not encoder_terms(fit(model(), pendulum(), recording, **SETTINGS))
 
 
-def test_it_is_fitted_or_not_as_asked():
+def test_option_decides_whether_eccentricity_is_fitted():
     plant = one_link()
     recording = swing(plant, LFM(1, [1.5e-3, 2.5e-3], v_smooth=V_SMOOTH), seconds=1.0)
     quick = {"windows": (0.5,), "max_steps": 1, "drag": False}

@@ -1,4 +1,4 @@
-"""Slip elements on tables of torque: recovery, choice against laws without memory, the start."""
+"""Slip elements on torque tables: recovery, choice over memoryless laws, initial state."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_positions_that_do_not_change_are_refused() -> None:
         fit_torque(slip_table().assign(q=0.1), "slip")
 
 
-def test_the_law_advances_as_the_fit_does() -> None:
+def test_law_and_fit_advance_the_state_equally() -> None:
     table = TorqueTable.from_pandas(slip_table()).joints[0]
     found = fit_slip(table, blocks(table, 5), loaded=False)
     model = Slip(1, found.coefficients)
@@ -67,7 +67,7 @@ def test_the_law_advances_as_the_fit_does() -> None:
 
 
 def without_torque(joint: JointTorque) -> JointTorque:
-    """Rows whose torque shows no deflection before them."""
+    """Rows whose torque gives no information on the deflection before them."""
     return replace(joint, tau=np.full_like(joint.tau, np.nan))
 
 
@@ -76,7 +76,7 @@ def found() -> TorqueFits:
     return fit_torque(slip_table(), "coulomb-viscous,arctan,stribeck,slip", folds=5)
 
 
-def test_another_run_is_predicted_to_the_noise(found: TorqueFits) -> None:
+def test_another_run_is_predicted_to_noise_level(found: TorqueFits) -> None:
     assert found.chosen == {"joint1": "Slip"}
     other = slip_table(seed=7)
     scores = {name: float(found.score(other, name)["rmse"].iloc[0]) for name in found.fits}
@@ -84,7 +84,7 @@ def test_another_run_is_predicted_to_the_noise(found: TorqueFits) -> None:
     assert min(e for name, e in scores.items() if name != "Slip") > 4 * scores["Slip"]
     shown = found.intervals()["value"]
     assert (shown[shown.index.str.match(r"F_\d")] > 1e-6).all()
-    # No rest was long.
+    # There was no long rest.
     assert not shown.index.str.startswith("d_r").any()
     widths = shown.index.str.startswith("d_").sum()
     assert 0 < widths < ELEMENTS
@@ -92,7 +92,7 @@ def test_another_run_is_predicted_to_the_noise(found: TorqueFits) -> None:
     assert abs(float(force) - FORCES.sum()) < 0.1 * FORCES.sum()
 
 
-def test_a_law_without_memory_is_chosen_where_there_is_none() -> None:
+def test_memoryless_law_is_chosen_for_friction_without_memory() -> None:
     time, q = strokes()
     qd = 20 * np.gradient(q, time)
     tau = np.tanh(qd / 3e-3) + 0.4 * qd + np.random.default_rng(1).normal(0, 0.05, len(q))
@@ -102,7 +102,7 @@ def test_a_law_without_memory_is_chosen_where_there_is_none() -> None:
 
 
 @pytest.mark.slow
-def test_friction_in_proportion_to_the_load_is_recognised() -> None:
+def test_load_proportional_friction_is_recognised() -> None:
     load = np.linspace(0.2, 2.0, 1500)
     found = fit_torque(slip_table(load=load), folds=5)
     assert found.chosen == {"joint1": "LoadSlip"}
@@ -110,7 +110,7 @@ def test_friction_in_proportion_to_the_load_is_recognised() -> None:
     assert float(found.score(other)["rmse"].iloc[0]) < 0.05
 
 
-def test_the_lead_in_shows_how_a_table_begins(found: TorqueFits) -> None:
+def test_initial_deflection_is_estimated_from_the_lead_in(found: TorqueFits) -> None:
     deflected = TorqueTable.from_pandas(slip_table(seed=4, start=-1.0))
     model, joint = found.fits["Slip"][0].model, deflected.joints[0]
     first = slice(20, 60)
@@ -122,7 +122,7 @@ def test_the_lead_in_shows_how_a_table_begins(found: TorqueFits) -> None:
     assert np.abs(blank).max() > 0.5
 
 
-def test_a_long_rest_adds_friction_that_the_first_motion_sheds() -> None:
+def test_friction_rise_after_a_long_rest_decays_in_the_first_motion() -> None:
     def rested(seed: int, excess: float) -> pd.DataFrame:
         """A table that begins with a rest of 0.3 s, after a move there and a longer rest."""
         table = slip_table(seed=seed, start=np.sign(excess))
@@ -135,20 +135,20 @@ def test_a_long_rest_adds_friction_that_the_first_motion_sheds() -> None:
 
     found = fit_torque(rested(0, 1.5), "slip", folds=5)
     for seed, excess in ((2, 1.5), (3, -1.0), (4, 0.0)):
-        # A tenth of the least excess, which is otherwise seen whole in the first strokes.
+        # A tenth of the smallest excess, all of which the first strokes otherwise show.
         assert float(found.score(rested(seed, excess))["rmse"].iloc[0]) < 0.1
 
 
-def test_a_table_without_torque_is_predicted_from_no_deflection(found: TorqueFits) -> None:
+def test_table_without_torque_is_predicted_from_zero_deflection(found: TorqueFits) -> None:
     other = slip_table(seed=5)
     blind = found.predict(other.drop(columns="tau"))[0]
-    # From where the elements have slipped once, the start is forgotten.
+    # Once the elements have slipped, the start is forgotten.
     np.testing.assert_allclose(blind[800:], found.predict(other)[0][800:], atol=0.02)
     with pytest.raises(ValueError, match="no column of friction torque"):
         found.score(other.drop(columns="tau"))
 
 
-def test_files_of_a_law_with_memory_predict_as_the_fit_does(
+def test_files_of_a_law_with_memory_give_the_predictions_of_the_fit(
     found: TorqueFits, tmp_path: Path
 ) -> None:
     write_torque_fits(found, tmp_path)
@@ -177,7 +177,7 @@ def test_negative_forces_are_refused() -> None:
         Slip(1, values)
 
 
-def test_no_closed_motion_gains_energy() -> None:
+def test_closed_motions_dissipate_energy() -> None:
     rng = np.random.default_rng(0)
     for law in (SLIP, LOAD_SLIP):
         memory = law.memory

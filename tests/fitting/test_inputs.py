@@ -1,4 +1,4 @@
-"""Inputs of friction besides the speed are chosen by evidence, and have to win on hold-out."""
+"""Friction inputs other than speed are chosen by evidence and must improve hold-out errors."""
 
 import math
 from dataclasses import replace
@@ -82,7 +82,7 @@ def recorded(request):
     return request.param, recording, fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
 
 
-def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
+def test_input_is_chosen_if_friction_depends_on_it(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH)
     task = prepare_task(model, pendulum(), [recording], FitOptions(**BRIEF))
@@ -103,7 +103,7 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         assert off.abs().max() < 0.1
 
 
-def test_the_law_with_inputs_starts_where_the_law_ended() -> None:
+def test_law_with_inputs_starts_from_the_fitted_law() -> None:
     """Smoothed states may lead to another minimum, in which every input seems to help."""
     plant, brief = pendulum(), {**BRIEF, "windows": (0.5, 1.5)}
     recording = swing(plant, truth("direction"), seconds=3.0)
@@ -116,7 +116,7 @@ def test_the_law_with_inputs_starts_where_the_law_ended() -> None:
 
 
 @pytest.mark.slow
-def test_dry_and_viscous_friction_differ_by_direction_in_their_own_ratios() -> None:
+def test_dry_and_viscous_friction_have_separate_direction_ratios() -> None:
     """The constant torque of a drive explains only the dry part."""
     time, step, inertia = 2e-3 * np.arange(2001), 2e-4, 0.08
     tau, q, v, turned = 3.0 * np.sin(4 * time) + 1.5 * np.sin(11 * time), 0.0, 0.0, []
@@ -146,7 +146,7 @@ def test_dry_and_viscous_friction_differ_by_direction_in_their_own_ratios() -> N
     assert not chosen_inputs(strict, law)[0]
 
 
-def test_the_fall_by_heat_is_recovered() -> None:
+def test_heat_dependence_is_recovered() -> None:
     """Although it cools faster than a long window lasts."""
     brief, true = {**BRIEF, "windows": (0.5, 3.0)}, truth("heat")
     recording = swing(pendulum(), true, seconds=6.0)
@@ -156,7 +156,7 @@ def test_the_fall_by_heat_is_recovered() -> None:
     found = widened_start(task, law, ["heat"])
     (motion,) = task.motions
     qd, qdd = torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd)
-    # Heat has no unit of its own: its capacity and the coefficient k_h scale each other.
+    # Heat is defined up to a scale: its capacity and the coefficient k_h scale each other.
     expected, fall = (
         m.coefficients_from(qd, qdd, m.schedule.states(qd, qdd))[..., -2:].prod(-1)
         for m in (true, found.model)
@@ -177,7 +177,7 @@ def test_the_fall_by_heat_is_recovered() -> None:
         ("load", {"F_c of joint1": (0.2, 0.3)}, set()),
     ],
 )
-def test_an_input_must_differ_from_zero_at_a_joint(name, intervals, expected):
+def test_input_must_be_nonzero_at_some_joint(name, intervals, expected):
     found = SimpleNamespace(
         intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()],
         plant=SimpleNamespace(joint_names=["joint1", "joint2"]),
@@ -186,7 +186,7 @@ def test_an_input_must_differ_from_zero_at_a_joint(name, intervals, expected):
 
 
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
-def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs, monkeypatch):
+def test_friction_change_counts_against_a_network_only_without_heat(inputs, monkeypatch):
     falls = [("friction", "The friction of joint1 falls by 30 %.")]
     monkeypatch.setattr("nfriction.fitting.diagnosis.changing_friction", lambda *_: falls)
     recording = swing(pendulum(), truth("heat"), seconds=3.0)
@@ -202,7 +202,7 @@ ONE = torch.ones(6, dtype=torch.float64)
 
 
 class Contest:
-    """A rival whose law and network leave these errors; without inputs they leave 1.0."""
+    """A rival whose law and network have these errors; without inputs they are 1.0."""
 
     found, several = None, True
 
@@ -234,7 +234,7 @@ def task():
         ({"of_law": 0.8 * ONE, "error": 0.7 * ONE}, True, False, True),
         ({"of_law": 0.8 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, False, True),
         ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False, False),
-        # An input that only the network shows.
+        # An input that only the network detects.
         ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, True, True),
         ({"of_law": 0.8 * ONE, "error": 0.7 * ONE, "apart": 1.1 * ONE}, False, False, False),
         # A loss of 1.2 standard errors on hold-out recordings does not overrule a clear gain.
@@ -248,7 +248,7 @@ def task():
         ({"of_law": 0.8 * ONE, "error": 0.8 * ONE, "accepted": False}, False, True, True),
     ],
 )
-def test_inputs_have_to_win_for_the_network_and_not_to_lose_for_its_law(
+def test_inputs_must_improve_the_network_and_not_worsen_its_law(
     task, monkeypatch, rival, driving, wins, trained
 ):
     gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
@@ -271,7 +271,7 @@ def test_inputs_have_to_win_for_the_network_and_not_to_lose_for_its_law(
 
 
 @pytest.mark.slow
-def test_a_chosen_input_wins_or_leaves_the_model_as_it_was(recorded) -> None:
+def test_chosen_input_improves_the_model_or_is_dropped(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     found = fit(model, pendulum(), recording, start=law, max_steps=3, **BRIEF)
@@ -294,14 +294,14 @@ def test_a_chosen_input_wins_or_leaves_the_model_as_it_was(recorded) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recorded", ["load"], indirect=True)
-def test_inputs_that_are_given_stay(recorded) -> None:
+def test_given_inputs_are_kept(recorded) -> None:
     _, recording, _ = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2, inputs=())
     assert not fit(model, pendulum(), recording, max_steps=2, **BRIEF).inputs
 
 
 def choice_of(gradient: float, lower: float = -9.0) -> _Choice:
-    """Errors 20 + g x + 3 x^2 / 2 of a candidate beside a variable of the law; priors of 1."""
+    """Errors 20 + g x + 3 x^2 / 2 of a candidate together with a law variable; priors of 1."""
     one, zero = torch.eye(2).double(), torch.zeros(2).double()
     slope = torch.tensor([0.0, gradient]).double()
     bounds = torch.tensor([0.0, lower]).double(), torch.tensor([0.0, 9.0]).double()
@@ -322,13 +322,13 @@ def test_evidence_is_the_integral_over_the_coefficient() -> None:
     assert best[1].share == pytest.approx((6.0 * 1.5 - 1.5 * 1.5**2) / 20.0)
 
 
-def test_an_input_that_its_sign_forbids_has_no_evidence() -> None:
+def test_input_of_the_wrong_sign_has_no_evidence() -> None:
     choice = choice_of(6.0, lower=0.0)
     assert choice.evidence([1])[0] < choice.evidence([])[0]
     assert choice.best([], 0.0) is None
 
 
-def test_an_input_is_chosen_beside_those_before() -> None:
+def test_input_is_chosen_in_addition_to_earlier_ones() -> None:
     eye, slope = torch.eye(2).double(), torch.tensor([-18.0, -3.0]).double()
     bounds = torch.full((2,), -9.0).double(), torch.full((2,), 9.0).double()
     errors = Quadratic(torch.tensor(18.0).double(), slope, 10.0 * eye)
@@ -342,7 +342,7 @@ def test_an_input_is_chosen_beside_those_before() -> None:
     assert choice.best(["heat"], 0.0) is None
 
 
-def test_window_states_are_at_their_best() -> None:
+def test_window_states_are_optimal() -> None:
     # (2 x + s - 1)^2 / 2 + s^2 / 2 at x = 0 and s = 1, which is least at s = 1 / 2 - x.
     hessian = torch.tensor([[4.0, 2.0], [2.0, 2.0]]).double()
     found = _of_shared(Quadratic(torch.tensor(0.5).double(), torch.tensor([0.0, 1.0]).double(),
@@ -356,7 +356,9 @@ def test_window_states_are_at_their_best() -> None:
     ("viscous", "by_direction", "driving"),
     [(1e-4, 0.4, False), (1e-4, -1.8, True), (1e-3, -0.9, False)],
 )
-def test_a_constant_torque_is_no_friction_by_direction(viscous, by_direction, driving) -> None:
+def test_constant_torque_is_not_direction_dependent_friction(
+    viscous, by_direction, driving
+) -> None:
     law = with_inputs(COULOMB_VISCOUS, ["direction"])
     model = FrictionModel(law, Constant(law, 1, [5e-3, viscous, by_direction]), V_SMOOTH)
     time = 2e-3 * np.arange(500)
@@ -367,8 +369,8 @@ def test_a_constant_torque_is_no_friction_by_direction(viscous, by_direction, dr
 
 
 @pytest.mark.parametrize("largest", [0.3, 0.5])
-def test_candidates_are_what_plant_and_motion_show(largest) -> None:
-    """A motor has no load of bearings, and less than half of the shortest wave is no wave."""
+def test_candidates_depend_on_plant_and_motion(largest) -> None:
+    """A motor has no bearing load, and less than half of the shortest wave is not a wave."""
     rotor = Rotor(inertia=0.02, mass=0.5, com=0.1)
     time = torch.arange(400).double().numpy() * 2e-3
     recording = Recording(time, largest * np.sin(9.0 * time)[:, None])
@@ -377,7 +379,7 @@ def test_candidates_are_what_plant_and_motion_show(largest) -> None:
     assert candidates(task) == ("direction", *position, "heat")
 
 
-def test_a_friction_of_the_load_is_simulated_with_the_loads_it_was_fitted_to(tmp_path) -> None:
+def test_load_dependent_friction_uses_the_same_loads_in_simulation(tmp_path) -> None:
     start = torch.tensor([1.0, 0.5], dtype=torch.float64)
     given = {"steps": 3, "sample_time": 1e-3, "gradients": False}
     rollout(pendulum(normal_load="bearing"), truth("load"), start, 0 * start, **given)
@@ -387,7 +389,7 @@ def test_a_friction_of_the_load_is_simulated_with_the_loads_it_was_fitted_to(tmp
         c(truth("load"), tmp_path, ModelInfo(rig=pendulum().to_dict()))
 
 
-def test_a_given_load_is_that_of_the_bearings(monkeypatch) -> None:
+def test_given_load_is_the_bearing_load(monkeypatch) -> None:
     def begun(task):
         raise RuntimeError(task.plant.to_dict()["normal_load"])
 
@@ -398,7 +400,7 @@ def test_a_given_load_is_that_of_the_bearings(monkeypatch) -> None:
         fit(NFCVFM(2, inputs=["load"]), pendulum(), recording, **BRIEF)
 
 
-def test_a_friction_of_the_position_is_simulated_with_the_positions_it_was_fitted_to() -> None:
+def test_position_dependent_friction_uses_the_same_positions() -> None:
     start = torch.tensor([1.0, 0.5], dtype=torch.float64)
     given = {"steps": 3, "sample_time": 1e-3, "gradients": False}
     rollout(rig("position"), truth("position"), start, 0 * start, **given)
@@ -409,7 +411,7 @@ def test_a_friction_of_the_position_is_simulated_with_the_positions_it_was_fitte
         rollout(rig("position"), LFM(2), start, 0 * start, **given)
 
 
-def test_a_fit_takes_normal_loads_on_the_plant_of_a_fit_by_position() -> None:
+def test_fit_by_load_can_start_from_the_plant_of_a_fit_by_position() -> None:
     recording = swing(pendulum(), truth("nothing"), seconds=1.0)
     found, plain = (fit(LFM(2), plant, recording, **BRIEF) for plant in (rig("position"),
                     pendulum(normal_load="bearing")))  # fmt: skip
@@ -436,7 +438,7 @@ def test_position_and_load_exclude_each_other(law, inputs) -> None:
         with_inputs(law, inputs)
 
 
-def test_waves_of_an_axis_fit_into_its_stroke() -> None:
+def test_wavelengths_of_an_axis_are_limited_by_its_stroke() -> None:
     axis, stroke = LinearAxis(mass=2.0), 2.5
     law = with_inputs(COULOMB_VISCOUS, ["position"])
     rippled = axis.replace(load_waves=torch.tensor([2 * math.pi * 2 / stroke]).double(),
@@ -455,7 +457,7 @@ def test_waves_of_an_axis_fit_into_its_stroke() -> None:
     nearest = min(possible, key=lambda one: abs(one - rate))
     seeing = with_position_load(task, law)
     assert float(seeing.plant.load_waves) == pytest.approx(nearest, rel=1e-3)
-    # Each half shows the wave, too, though it covers less of the stroke.
+    # Each half contains the wave, too, though it covers less of the stroke.
     halves = [recording[:1000], recording[1000:]]
     task = prepare_task(NFCVFM(1, v_smooth=V_SMOOTH), axis, halves, FitOptions(**BRIEF))
     seeing = with_position_load(task, law)

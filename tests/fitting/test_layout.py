@@ -1,4 +1,4 @@
-"""The package stays shallow: few floors of imports, few arguments, no questions about types."""
+"""`fitting` stays shallow: few import levels, few arguments, no type tests."""
 
 import ast
 from functools import cache
@@ -17,15 +17,15 @@ TREES = {
 
 
 @cache
-def floor(module: str) -> int:
+def level(module: str) -> int:
     imported = {
         node.module for node in ast.walk(TREES[module]) if isinstance(node, ast.ImportFrom)
     } & TREES.keys()
-    return 1 + max(map(floor, imported), default=0)
+    return 1 + max(map(level, imported), default=0)
 
 
-def test_at_most_eight_floors() -> None:
-    assert max(map(floor, TREES)) <= 8
+def test_at_most_eight_import_levels() -> None:
+    assert max(map(level, TREES)) <= 8
 
 
 def test_only_the_entry_point_has_more_than_eight_arguments() -> None:
@@ -39,7 +39,7 @@ def test_only_the_entry_point_has_more_than_eight_arguments() -> None:
     assert many == ["fit"]
 
 
-def test_no_schedule_is_asked_for_its_type() -> None:
+def test_no_schedule_is_tested_for_its_type() -> None:
     asked = [
         ast.unparse(node)
         for tree in TREES.values()

@@ -54,7 +54,7 @@ def sets_stay(monkeypatch):
 
 @pytest.mark.usefixtures("sets_stay")
 @pytest.mark.parametrize("best", range(len(PRIOR_SHARES)))
-def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch, best):
+def test_prior_with_the_best_predictions_is_chosen(constant, monkeypatch, best):
     recording, found = constant
     seen = []
 
@@ -67,24 +67,24 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
     model = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
-    # As of other windows, so that the law is judged by `squares`, too.
+    # As of other windows, so that the law is scored by `squares`, too.
     law = replace(found, residuals=found.residuals[:, 1:])
     fit(model, one_link(), recording, start=law, windows=(0.5,), fit_plant=False, max_steps=2)
     tried = len(PRIOR_SHARES)
     assert seen[:tried] == pytest.approx([0.6 * share for share in PRIOR_SHARES])
-    # The other windows are held out of the best alone, and then it is judged over the law's.
+    # Only the best is trained without the other windows too, and then compared with the law.
     assert seen[tried:] == [seen[best]] * DEFAULTS.folds
-    # It travels with the model as what it was fitted with.
+    # It is stored with the model as its prior.
     assert model.schedule.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
 
 
 @pytest.mark.usefixtures("sets_stay")
 @pytest.mark.parametrize(("ratio", "kept"), [(0.75, True), (1.25, False)])
 @pytest.mark.parametrize("same_windows", [True, False])
-def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
+def test_network_worse_than_its_law_on_long_windows_is_rejected(
     constant, monkeypatch, ratio, kept, same_windows
 ):
-    """Short windows hardly show a force that is slightly off."""
+    """Short windows hardly show a force that is slightly wrong."""
     recording, law = constant
     error = float(law.residuals.square().mean().sqrt())
     if not same_windows:
@@ -105,7 +105,7 @@ def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
-def test_a_law_that_is_not_linear_has_a_network_too(constant):
+def test_nonlinear_law_has_a_network_too(constant):
     recording, _ = constant
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 4}
     law = fit(Stribeck(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
@@ -120,23 +120,23 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
-def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant, monkeypatch):
+def test_plant_stays_within_the_uncertainty_of_the_laws_fit(constant, monkeypatch):
     recording, _ = constant
     settings = {"windows": (0.5,), "max_steps": 3}
     law = fit(NCFM(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
-    # As of other windows, so that the law is judged by `squares`, too.
+    # As of other windows, so that the law is scored by `squares`, too.
     law = replace(law, residuals=law.residuals[:, 1:])
 
     def squares(test, problem, friction, plant, *_):
-        # Any network beats the law, and none another, so that no gain lets the plant go.
+        # Every network beats the law but not the others, so no gain relaxes the plant's prior.
         learns = isinstance(problem.friction.schedule, NeuroFuzzy)
         return torch.full((len(test),), 0.5 if learns else 1.0)
 
     monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", squares)
 
     def moved() -> float:
-        """By how many standard deviations that the law's fit left open, at most."""
+        """Largest change in standard deviations of the law's fit."""
         model = NFNCFM(1, v_smooth=V_SMOOTH, **SMALL)
         found = fit(model, one_link(), recording, start=law, **settings)
         pairs = zip(found.plant_terms, law.plant_terms, strict=True)
@@ -144,15 +144,15 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
 
     as_left = moved()
     assert as_left < 3.0
-    # How far it moves is up to the data; that the uncertainty of the law's fit bounds it is ours.
-    monkeypatch.setattr(Interval, "sd", property(lambda told: 1e-3 * open_[told.name]))
+    # Data decide how far it moves; that the law's fit bounds the change is our choice.
+    monkeypatch.setattr(Interval, "sd", property(lambda interval: 1e-3 * open_[interval.name]))
     assert moved() < min(1e-3, 0.1 * as_left)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 @pytest.mark.parametrize("freed", [False, True])
-def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monkeypatch, freed):
+def test_plant_prior_is_relaxed_only_for_a_hold_out_gain(with_plant, monkeypatch, freed):
     recording, law = with_plant
     seen, trained = [], []
 
@@ -170,7 +170,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
         first = 1.0 if network_sd(problem) == seen[0][1] else 1.01
         if expected(problem) == seen[0][0]:
             return 0.5 * first * found
-        # Less over all; but a gain only where it is less on nearly every window.
+        # Less in total, but a gain only if it is less on nearly every window.
         return 0.4 * first * (found if freed else torch.linspace(0.6, 1.86, len(test)))
 
     def search(self, problem, start, *others):
@@ -189,7 +189,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     assert [trial[0] for trial in seen] == rounds * [near] + rounds * [free]
     assert near != free
     assert all(a <= b for a, b in zip(near, free, strict=True))
-    # Each search tries both priors, and the best is gone on with from where it stood.
+    # Each search tries both priors, and the best is continued from its result.
     assert [trial[1] for trial in seen] == 2 * [trial[1] for trial in seen[:rounds]]
     best, last = seen[rounds if freed else 0], trained[-1]
     assert last[:2] == best[:2]
@@ -199,7 +199,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
-def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
+def test_diverging_law_does_not_relax_the_plant_prior(with_plant, monkeypatch):
     recording, law = with_plant
     trained = []
 
@@ -226,7 +226,7 @@ PLACES = range(2 * len(PRIOR_SHARES))
 @pytest.mark.parametrize(
     "place", [pytest.param(k, marks=[pytest.mark.slow] * (0 < k < PLACES[-1])) for k in PLACES]
 )
-def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, place, monkeypatch):
+def test_network_stopped_before_hold_out_is_replaced_by_its_law(with_plant, place, monkeypatch):
     recording, law = with_plant
     model, begun = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
 
@@ -250,7 +250,7 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
 
 
 @pytest.mark.parametrize("worse", ["", "Network rejected: it is worse."])
-def test_a_stop_while_inputs_are_chosen_keeps_the_verdict(constant, monkeypatch, worse):
+def test_stop_during_input_selection_keeps_the_decision(constant, monkeypatch, worse):
     recording, law = constant
     judged = []
 
@@ -268,7 +268,7 @@ def test_a_stop_while_inputs_are_chosen_keeps_the_verdict(constant, monkeypatch,
     assert not found.converged
     assert model.schedule.parameter_vector().any() == (not worse)
     assert worse in found.status
-    # Inputs have to beat the network that is kept, or its law.
+    # Inputs must beat the network that is kept, or its law.
     ((accepted, squares),) = judged
     assert accepted == (not worse)
     assert squares.isfinite().all()
@@ -296,7 +296,7 @@ def where_even_sets_are_wrong():
     return Recording(5e-3 * np.arange(len(q)), q, convention="relative,upright", name="step")
 
 
-def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
+def test_sets_adapt_and_evidence_rises_if_even_sets_are_wrong(
     where_even_sets_are_wrong, monkeypatch
 ):
     recording, trials, adapted = where_even_sets_are_wrong, [], []
@@ -326,7 +326,7 @@ def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)
 
 
-def test_a_stop_while_a_network_trains_on_keeps_the_one_accepted(where_even_sets_are_wrong):
+def test_stop_during_further_training_keeps_the_accepted_network(where_even_sets_are_wrong):
     names = []
 
     def stop(name, step):

@@ -1,4 +1,4 @@
-"""Adjustable plant terms: what data can tell, ratios and offsets within bounds."""
+"""Adjustable plant terms: identifiability, ratios and offsets within bounds."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_free_swing_keeps_one_gravity_term_as_the_scale():
     }  # fmt: skip
 
 
-def test_a_wheel_has_no_angle_to_be_off_and_coasting_keeps_its_inertia():
+def test_wheel_has_no_angle_offset_and_coasting_keeps_its_inertia():
     driven = {"inertia 11", "gear loss 1", "torque offset 1 [N m]"}
     assert set(names(Rotor(0.02), driven=(0,), largest_torque=1.0)) == driven
     assert names(Rotor(0.02), driven=()) == []
@@ -35,19 +35,19 @@ def test_a_wheel_has_no_angle_to_be_off_and_coasting_keeps_its_inertia():
     assert set(names(Rotor(0.05, 0.5, 0.3), driven=(0,), largest_torque=1.0)) == driven | pendulum
 
 
-def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():
-    told = names(pendulum(), driven=(1,), largest_torque=1.0)
-    assert "torque offset 2 [N m]" in told
-    assert "torque offset 1 [N m]" not in told
-    assert "gravity 1" in told
-    # Nor has a lone drive a gain: it would be but the scale of the masses.
-    assert not [name for name in told if "gain" in name]
-    # Unless an arm sets the scale, whose inertia is kept.
+def test_undriven_joint_has_no_torque_offset():
+    terms = names(pendulum(), driven=(1,), largest_torque=1.0)
+    assert "torque offset 2 [N m]" in terms
+    assert "torque offset 1 [N m]" not in terms
+    assert "gravity 1" in terms
+    # A single drive has no gain either: it would only scale the masses.
+    assert not [name for name in terms if "gain" in name]
+    # Unless an arm with a fixed inertia sets the scale.
     armed = names(rigs.tlrip("free"), driven=(0,), largest_torque=1.0)
     assert "torque gain 1" in armed
 
 
-def test_what_a_plant_already_has_of_drag_and_loss_may_all_go():
+def test_existing_drag_and_loss_may_vanish_completely():
     loss, drag = torch.tensor([0.1, 0.2], dtype=F64), torch.full((2,), 0.03, dtype=F64)
     plant = pendulum().replace(gear_loss=loss, drag_linear=drag)
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0, drag=True)
@@ -59,13 +59,13 @@ def test_what_a_plant_already_has_of_drag_and_loss_may_all_go():
     }  # fmt: skip
 
 
-def test_terms_that_are_not_there_are_not_adjusted():
+def test_absent_terms_are_not_adjusted():
     assert not [n for n in names(pendulum(), driven=()) if "armature" in n or "drag" in n]
     assert "armature 2" in names(pendulum(armature=[0.0, 1e-4]), driven=())
     assert "armature 1" not in names(pendulum(armature=[0.0, 1e-4]), driven=())
     drag = ["drag linear", "drag quadratic", "drag reach"]
     assert names(pendulum(), driven=(), drag=True)[-3:] == drag
-    # A single link's reach is but the scale of its drag, and its linear drag viscous friction.
+    # A single link's reach only scales its drag, and its linear drag acts as viscous friction.
     single = names(rigs.multiarm_single(), driven=(), drag=True)
     assert [n for n in single if "drag" in n] == ["drag quadratic"]
     assert names(LinearAxis(2.0), driven=(0,), largest_torque=1.0) == [
@@ -76,7 +76,7 @@ def test_terms_that_are_not_there_are_not_adjusted():
     assert moved[-1] == "asymmetry [N s/m]"
 
 
-def test_the_drive_of_an_axis_may_hold_its_weight():
+def test_drive_of_an_axis_may_carry_its_weight():
     """A vertical axis needs a constant force far above the bias of a sensor."""
     time = np.arange(1500) * 2e-3
     drive = 20.0 + 4.0 * np.cos(9 * time) + 2.0 * np.cos(23 * time)
@@ -96,7 +96,7 @@ def test_an_arm_has_no_hanging_position_and_no_encoder_terms():
     assert links == [f"encoder {part} {j} [rad]" for j in (2, 3, 4) for part in ("cosine", "sine")]
 
 
-def test_ratios_scale_their_terms_and_nothing_else():
+def test_ratios_scale_only_their_terms():
     plant = pendulum()
     terms = plant_parameters(plant, driven=())
     vector = torch.zeros(len(terms), dtype=F64)
@@ -114,7 +114,7 @@ def test_ratios_scale_their_terms_and_nothing_else():
     [
         # The last link's centre of mass, and the inertia about it.
         ({"com": [0.05, 0.07, 0.066]}, {"gravity 3", "inertia 33"}),
-        # The first link's length moves what hangs on it, and counts in its own moment, too.
+        # The first link's length moves the next link, and affects its own moment, too.
         ({"length": [0.105, 0.12, 0.1]}, {"length 1", "gravity 1", "inertia 11"}),
         ({"length": [0.1, 0.126, 0.1]}, {"length 2", "gravity 2", "inertia 22"}),
         ({"com": [0.05, 0.08, 0.066], "length": [0.105, 0.126, 0.1]},
@@ -122,7 +122,7 @@ def test_ratios_scale_their_terms_and_nothing_else():
           *(f"inertia {j}{j}" for j in (1, 2, 3))}),
     ],
 )  # fmt: skip
-def test_what_is_wrong_of_a_link_takes_the_ratios_of_that_link_alone(wrong, ratios):
+def test_error_of_a_link_changes_only_the_ratios_of_that_link(wrong, ratios):
     link = {
         "mass": [0.1, 0.2, 0.1], "com": [0.05, 0.07, 0.06], "length": [0.1, 0.12, 0.1],
         "inertia": [1e-4, 2e-4, 1e-4],
@@ -182,7 +182,7 @@ def test_a_batch_of_vectors_gives_a_batch_of_plants():
         torch.testing.assert_close(one.forward_dynamics(*state), row)
 
 
-def test_bounds_hold_the_given_plant():
+def test_bounds_contain_the_given_plant():
     terms = plant_parameters(pendulum(), driven=(0, 1), largest_torque=2.0, drag=True)
     assert all(t.lower <= 0.0 < t.upper and t.prior_sd > 0 for t in terms)
     offset = next(t for t in terms if "torque_offset" in t.change)
@@ -190,7 +190,7 @@ def test_bounds_hold_the_given_plant():
 
 
 def test_links_in_a_horizontal_plane_have_no_weight_to_fit():
-    """Gravity of the first link, lengths and zeros of angles would have no effect of their own."""
+    """Gravity of the first link, lengths and zeros of angles would have no effect."""
     plant = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], gravity=1e-6)
     names = [term.name for term in plant_parameters(plant, driven=[0, 1])]
     assert [n for n in names if n.startswith(("inertia", "gravity", "length", "angle"))] == [

@@ -1,4 +1,4 @@
-"""Fits of friction with memory to motions: recovery, starts of windows, what data leave open."""
+"""Fits of friction with memory to motions: recovery, initial states, identifiability."""
 
 from dataclasses import replace
 from functools import cache
@@ -29,12 +29,12 @@ from tests.fitting.recordings import F64, pendulum
 AXIS = LinearAxis(0.5)
 SOFT = (1.0, 0.5, 0.05, 300.0, 5.0, 0.4)
 SLIPS = (1.0, 0.5, 0.3, 0.2, 0.1, 5e-3, 0.01, 0.02, 0.05, 0.1, 3e-3, 0.3, 0.3)
-# Presliding over a thousandth of an encoder's count.
+# Presliding over a thousandth of an encoder count.
 STIFF = (1.0, 0.5, 0.05, 3e6, 5.0, 0.4)
 
 
 def pushed(model: FrictionModel, seed: int, *, seconds: float, rate: int) -> Recording:
-    """An axis from rest, pushed below breakaway and beyond, read by 14 bits."""
+    """An axis from rest, pushed below breakaway and beyond, with a 14-bit encoder."""
     random = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     waves = [
@@ -64,10 +64,10 @@ def recorded(truth: tuple[float, ...], seed: int, seconds: float, rate: int) -> 
                      marks=pytest.mark.slow),
     ],
 )  # fmt: skip
-def test_derivatives_follow_the_deflections_from_a_windows_start(
+def test_derivatives_include_the_initial_deflections(
     name: str, plant: Plant, values: tuple[float, ...]
 ) -> None:
-    """Gradients of the cost are its differences, also by coefficients that scale the start."""
+    """Gradients of the cost equal its differences, also for coefficients that scale the start."""
     joints = plant.joints
     model = model_by_name(name)(joints, values).requires_grad_(False)
     start = torch.tensor([1.6, 0.8], dtype=F64)[:joints]
@@ -98,7 +98,7 @@ def test_derivatives_follow_the_deflections_from_a_windows_start(
 
 def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
     model = LuGre(1, SOFT).requires_grad_(False)
-    # Held below breakaway, then slid.
+    # Held below breakaway, then sliding.
     force = np.repeat([[0.9], [3.0]], 400, 0)
     zero = torch.zeros(1, dtype=F64)
     run = rollout(AXIS, model, zero, zero, torch.as_tensor(force), sample_time=1e-3)
@@ -109,12 +109,12 @@ def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
     assert share is not None
     largest = sum(SOFT[:2]) / SOFT[3]
     true = run.law_state[[first for _, first, _ in windows.spans]] / largest
-    # The second and fourth begin amid a push; viscous friction is taken for a deflection, too.
+    # The second and fourth begin during a push; viscous friction counts as deflection, too.
     assert float(share[1]) == pytest.approx(float(true[1]), abs=0.05)
     assert float(true[3]) < float(share[3]) <= 1.0
 
 
-def test_a_law_of_ones_own_may_name_its_coefficients_otherwise() -> None:
+def test_user_defined_law_may_use_other_coefficient_names() -> None:
     coefficients = torch.tensor([1.0, 0.4, 300.0], dtype=F64)
     named = [replace(c, name=f"own_{k}") for k, c in enumerate(DAHL.coefficients)]
     own = replace(DAHL, name="own", coefficients=tuple(named))
@@ -129,7 +129,7 @@ def short():
 
 
 @pytest.mark.slow
-def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_hide() -> None:
+def test_searches_start_with_the_stribeck_rise_hidden_by_sticking() -> None:
     recording = recorded((1.0, 0.33, 0.15, 1600.0, 19.4, 0.3), 0, 5.0, 500)
     begun = fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False, max_steps=0)
     _, rise, _, stiffness, *_ = begun.model.schedule.values[0].tolist()
@@ -139,8 +139,8 @@ def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_
 
 
 @pytest.mark.slow
-def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
-    """By all rows F_c is 0.42 and F_v 1.6: a contact that yields balances any torque."""
+def test_rows_near_reversals_do_not_bias_sliding_friction() -> None:
+    """With all rows F_c is 0.42 and F_v 1.6: a contact that yields balances any torque."""
     time = 2e-3 * np.arange(2001)
     tau = ((0.7 + 2.0 * np.sin(np.pi * time / 4) ** 2) * np.sin(7 * time))[:, None]
     zero = torch.zeros(1, dtype=F64)
@@ -153,7 +153,7 @@ def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
     assert f_v == pytest.approx(0.4, abs=0.1)
 
 
-def test_presliding_and_sliding_give_all_coefficients(short) -> None:
+def test_presliding_and_sliding_determine_all_coefficients(short) -> None:
     _, found = short
     assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.03)
     assert all(i.low < x < i.high for i, x in zip(found.intervals, SOFT, strict=True))
@@ -165,7 +165,7 @@ def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> Non
     recording, found = short
     errors = score(found.plant, found.model, recording, limit=False)
     assert errors.free_run.all < 1e-3
-    # Windows go on from the deflection that the motion before has left.
+    # Windows continue from the deflection of the motion before.
     assert errors.windows["1"].all < 1e-3
     assert "sigma_0 of joint1" in found.summary()
     assert found.uncertainty is not None
@@ -181,20 +181,20 @@ def geared():
     return recording, fit("gear", AXIS, recording, method="equation_error")
 
 
-def test_a_gears_loss_needs_the_drives_torque(geared) -> None:
+def test_gear_loss_needs_the_drive_torque(geared) -> None:
     recording, found = geared
     undriven = recording._replace(tau=None, name="swing")
-    told = "in swing, and gear reads the drive's torque; add tau or use dahl"
-    with pytest.raises(ValueError, match=told):
+    message = "in swing, and gear reads the drive's torque; add tau or use dahl"
+    with pytest.raises(ValueError, match=message):
         fit("gear", AXIS, undriven, method="equation_error")
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         score(found.plant, found.model, undriven, limit=False)
     # Before any fit, whose result would be lost.
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         compare(AXIS, ["viscous", "gear"], recording, undriven, callback=pytest.fail)
 
 
-def test_a_gears_curve_is_that_of_a_drive_without_torque(geared) -> None:
+def test_gear_friction_curve_has_zero_drive_torque(geared) -> None:
     """Its load is a torque [N m]: 1 N m is no load at rest."""
     recording, found = geared
     constants = found.model.schedule.values
@@ -211,7 +211,7 @@ def test_a_gears_curve_is_that_of_a_drive_without_torque(geared) -> None:
     assert not known.torque_sd(found.model, torch.tensor([[0.5]], dtype=F64)).any()
 
 
-def test_what_is_not_exported_loses_no_comparison(geared, tmp_path, caplog) -> None:
+def test_model_that_cannot_be_exported_does_not_stop_a_comparison(geared, tmp_path, caplog) -> None:
     recording, found = geared
     lugre = replace(found, model=LuGre(1, SOFT).requires_grad_(False))
     slower = recording[np.arange(len(recording.time)) % 2 == 0]
@@ -227,7 +227,7 @@ def test_what_is_not_exported_loses_no_comparison(geared, tmp_path, caplog) -> N
 
 @pytest.mark.slow
 def test_shares_of_a_small_torque_are_identifiable() -> None:
-    """A share is judged by the torque that it takes, which here is 0.3 mN."""
+    """A share is judged by its torque, which is 0.3 mN here."""
     size = 1e-4
     large = pushed(Gear(1, (0.4, 0.08, 0.2, 0.3, 400.0)).requires_grad_(False), 3,
                    seconds=3.0, rate=200)  # fmt: skip
@@ -237,7 +237,7 @@ def test_shares_of_a_small_torque_are_identifiable() -> None:
 
 
 @pytest.mark.slow
-def test_gear_loss_is_found_in_both_directions_of_the_power() -> None:
+def test_gear_loss_is_recovered_in_both_directions_of_power() -> None:
     truth = (0.4, 0.08, 0.2, 0.3, 400.0)
     recording = pushed(Gear(1, truth).requires_grad_(False), 3, seconds=10.0, rate=500)
     found = fit("gear", AXIS, recording, windows=(0.5, 2.0))
@@ -251,8 +251,8 @@ def test_gear_loss_is_found_in_both_directions_of_the_power() -> None:
     assert gear < 0.2 * other
 
 
-def test_a_law_of_gears_leaves_the_plant_none_of_their_loss() -> None:
-    """Only the sum of both losses is determined, so that the law's would be pulled to zero."""
+def test_law_with_gear_loss_removes_it_from_the_plant() -> None:
+    """Only the sum of both losses is identifiable, so the law's would be drawn to zero."""
     recording = pushed(Gear(1, (0.4, 0.1, 0.1, 0.3, 400.0)).requires_grad_(False), 3,
                        seconds=2.0, rate=100)._replace(unit="rad")  # fmt: skip
     names = []
@@ -264,7 +264,7 @@ def test_a_law_of_gears_leaves_the_plant_none_of_their_loss() -> None:
 
 
 @pytest.mark.slow
-def test_a_network_that_the_data_do_not_ask_for_is_left_out(short) -> None:
+def test_unneeded_network_is_omitted(short) -> None:
     recording, law = short
     found = fit("neuro-fuzzy:lugre", AXIS, recording, windows=(0.5,), fit_plant=False, start=law)
     assert "constant law is kept" in found.status
@@ -274,7 +274,7 @@ def test_a_network_that_the_data_do_not_ask_for_is_left_out(short) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_corrects_bristles_where_friction_is_another() -> None:
+def test_network_corrects_a_bristle_law_for_other_friction() -> None:
     truth = NFLuGre(1, SOFT)
     schedule = truth.schedule
     schedule.set_range(3.0, [-40.0, 40.0])
@@ -290,20 +290,20 @@ def test_a_network_corrects_bristles_where_friction_is_another() -> None:
     found = fit("neuro-fuzzy:lugre", AXIS, [first, second], **given, start=law)
     better, plain = (score(f.plant, f.model, apart, limit=False).free_run.all for f in (found, law))
     assert better < 0.5 * plain
-    # The contact stores energy at one stiffness.
+    # The contact stores energy with one stiffness.
     at = torch.linspace(-2.0, 2.0, 9, dtype=F64)[:, None]
     stiffness = found.model.coefficients(at, 10.0 * at)[..., 3]
     assert float(np.ptp(stiffness.numpy())) == 0.0
 
 
 @pytest.mark.slow
-def test_stiffness_that_the_encoder_hides_is_not_identifiable() -> None:
+def test_stiffness_below_encoder_resolution_is_unidentifiable() -> None:
     recordings = [recorded(STIFF, seed, 20.0, 1000) for seed in (0, 1)]
     found = fit("lugre", AXIS, recordings, windows=(0.5,))
     assert {"sigma_0 of joint1", "sigma_1 of joint1"} <= set(found.unidentifiable)
     interval = next(i for i in found.intervals if i.name == "sigma_0 of joint1")
     assert interval.low < STIFF[3] < interval.high
-    # Sliding still shows the others.
+    # Sliding still determines the others.
     values = found.model.schedule.values[0]
     assert values[[0, 5]].tolist() == pytest.approx([STIFF[0], STIFF[5]], rel=0.02)
 
@@ -315,21 +315,21 @@ def by_default() -> FitResult:
 
 
 @pytest.mark.slow
-def test_default_fits_find_coefficients_and_plant(by_default: FitResult) -> None:
+def test_default_fits_recover_coefficients_and_plant(by_default: FitResult) -> None:
     assert by_default.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.02)
     assert float(by_default.plant.mass) == pytest.approx(0.5, rel=1e-3)
 
 
 @pytest.mark.slow
-def test_intervals_of_default_fits_hold_the_coefficients(by_default: FitResult) -> None:
-    """Of motions that come again after 10 s, and the encoder's rounding with them."""
+def test_intervals_of_default_fits_contain_the_coefficients(by_default: FitResult) -> None:
+    """With motions that repeat after 10 s, and the encoder's quantisation error with them."""
     held = [i.low <= x <= i.high for i, x in zip(by_default.intervals, SOFT, strict=False)]
     assert sum(held) >= 4
 
 
 @pytest.mark.slow
-def test_slip_elements_follow_a_bristle() -> None:
-    """Five widths in fixed ratios make up a contact that yields over one."""
+def test_slip_elements_approximate_a_bristle() -> None:
+    """Five widths in fixed ratios represent a contact that yields over one displacement."""
     recording = recorded(SOFT, 0, 5.0, 500)
     found = fit(MaxwellSlip(1), AXIS, recording, windows=(0.5,), fit_plant=False)
     plain = fit("stribeck", AXIS, recording, windows=(0.5,), fit_plant=False)

@@ -1,4 +1,4 @@
-"""Slip elements whose friction follows temperature, load, direction and position of a table."""
+"""Slip elements with friction that depends on a table's temperature, load, direction, position."""
 
 from pathlib import Path
 
@@ -50,11 +50,11 @@ def test_temperature_and_ripple_are_found_and_predict_another_run(found: TorqueF
     other = recorded(seed=5)
     plain, own = (float(found.score(other, name)["rmse"].iloc[0]) for name in found.fits)
     assert own < 0.2 * plain
-    # The noise has 0.02.
+    # The noise is 0.02.
     assert own < 0.04
 
 
-def test_another_zero_of_the_encoder_is_named(
+def test_different_encoder_zero_is_named(
     found: TorqueFits, caplog: pytest.LogCaptureFixture
 ) -> None:
     other = recorded(seed=6)
@@ -67,7 +67,7 @@ def test_another_zero_of_the_encoder_is_named(
     assert record.args[1] == pytest.approx(0.25 * PERIOD, abs=PERIOD / 24)  # type: ignore[index]
 
 
-def test_what_friction_does_not_follow_is_dropped() -> None:
+def test_inputs_without_effect_on_friction_are_dropped() -> None:
     found = fit_torque(recorded(ripple=0.0, warm=0.0), "slip,neuro-fuzzy:slip")
     assert found.chosen == {"joint1": "Slip"}
     assert found.fits["NFSlip"][0].model.schedule.followed() == ()
@@ -75,12 +75,12 @@ def test_what_friction_does_not_follow_is_dropped() -> None:
     assert errors["Slip"].iloc[0] == pytest.approx(errors["NFSlip"].iloc[0], rel=1e-9)
 
 
-def test_a_table_without_such_a_column_is_refused(found: TorqueFits) -> None:
+def test_table_without_a_required_column_is_refused(found: TorqueFits) -> None:
     with pytest.raises(ValueError, match="no column temperature"):
         found.predict(recorded(seed=5).drop(columns="temperature"), "neuro-fuzzy:slip")
 
 
-def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
+def test_files_keep_the_input_dependence(found: TorqueFits, tmp_path: Path) -> None:
     save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json")
     again = load(tmp_path / "model.json")
     assert isinstance(again, NFSlip)
@@ -88,25 +88,25 @@ def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
         assert torch.equal(again.state_dict()[name], value)
 
 
-def test_info_says_what_the_friction_follows(
+def test_info_lists_the_inputs_of_friction(
     found: TorqueFits, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json", ModelInfo(unit="m"))
     assert cli.main(["info", str(file)]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     period = float(found.fits["NFSlip"][0].model.schedule.period[0])
-    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in said
-    assert f"a period of {period:.4g} m\n" in said
+    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in printed
+    assert f"a period of {period:.4g} m\n" in printed
 
 
-def test_the_period_of_a_long_table_is_found() -> None:
+def test_period_is_found_in_a_long_table() -> None:
     joint = TorqueTable.from_pandas(recorded(rows=12000)).joints[0]
     ripple = _Ripple.of(joint, joint.tau, blocks(joint, 10))
     assert ripple is not None
     assert 2 * np.pi / ripple.wave() == pytest.approx(PERIOD, rel=1e-3)
 
 
-def test_simulations_and_controllers_refuse_what_they_do_not_record(found: TorqueFits) -> None:
+def test_simulations_and_controllers_refuse_unavailable_inputs(found: TorqueFits) -> None:
     model, zero = found.model("neuro-fuzzy:slip"), torch.zeros(1).double()
     with pytest.raises(ValueError, match="take slip"):
         rollout(LinearAxis(1.0), model, zero, zero, steps=2, sample_time=1e-3)

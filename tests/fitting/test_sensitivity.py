@@ -87,7 +87,7 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch, caplog):
         torch.testing.assert_close(found[i], exact, rtol=1e-10, atol=1e-10)
 
 
-def test_eager_pieces_do_not_show(monkeypatch):
+def test_eager_chunks_do_not_change_the_result(monkeypatch):
     """More samples than are linearised together give the same derivatives."""
     plant, model = LinearAxis(2.0), model_by_name("NCFM")(1)
     terms = plant_parameters(plant, driven=(0,), largest_torque=1.0)
@@ -106,7 +106,7 @@ def test_a_plant_may_have_no_adjustable_terms(monkeypatch):
     torch.testing.assert_close(found, eager.after_step(*given), rtol=1e-10, atol=1e-10)
 
 
-def test_the_start_slope_is_the_frictionless_acceleration_s():
+def test_start_derivative_is_that_of_the_frictionless_acceleration():
     plant = pendulum()
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0)
     state, _, tau, _, vector = samples(2, 2, len(terms))
@@ -142,7 +142,7 @@ def rows_of(name, steps, substeps, stride):
 
 
 @pytest.mark.parametrize("piece", [6, 100])
-def test_pieces_of_a_run_are_the_whole(piece, monkeypatch):
+def test_chunks_of_a_run_equal_the_whole(piece, monkeypatch):
     _, whole, end = rows_of("NFLFM", 10, 1, 1)
     monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
     samples, found, last = rows_of("NFLFM", 10, 1, 1)
@@ -153,8 +153,8 @@ def test_pieces_of_a_run_are_the_whole(piece, monkeypatch):
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 @pytest.mark.parametrize(("substeps", "stride"), [(1, 3), (3, 1), (3, 2)])
-def test_a_block_is_the_chain_of_its_steps(name, substeps, stride):
-    """Also where steps are left after the last whole block."""
+def test_block_is_the_product_of_its_steps(name, substeps, stride):
+    """Also if steps remain after the last complete block."""
     steps = 21 if substeps > 1 else 7
     _, every, end = rows_of(name, steps, 1, 1)
     samples, found, last = rows_of(name, steps, substeps, stride)

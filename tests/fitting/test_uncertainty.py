@@ -1,4 +1,4 @@
-"""What is left open of coefficients is what their parameters leave open."""
+"""The uncertainty of coefficients follows from that of their parameters."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ F64 = torch.float64
 
 @pytest.fixture(scope="module")
 def swings():
-    """Two swings of a pendulum with known friction, as an encoder reads them."""
+    """Two swings of a pendulum with known friction, sampled by an encoder."""
     plant, made = rigs.multiarm_single(), []
     truth = LFM(1, [4e-4, 2e-3]).requires_grad_(False)
     for k, start in enumerate((2.0, 1.2)):
@@ -43,7 +43,7 @@ def fits(swings):
     options = {"windows": (1.0,), "fit_plant": False, "drag": False}
     law = fit(LFM(1), *swings, **options)
     with pytest.MonkeyPatch.context() as patch:
-        # Nothing is left for a network to find here; it is to be kept all the same.
+        # The network has nothing to correct here, but it must be kept.
         patch.setattr("nfriction.fitting.strategy.neurofuzzy.improves", lambda *_, **__: True)
         patch.setattr(Validation, "trained_on", lambda self, trial: trial)
         patch.setattr(Validation, "lost_over_long_windows", lambda *_: "")
@@ -52,8 +52,8 @@ def fits(swings):
         return law, fit(network, *swings, start=law, **options)
 
 
-def test_intervals_know_the_noise_of_the_torque():
-    """It moves all samples after it, within windows whose start hides most of it."""
+def test_intervals_include_torque_noise():
+    """It affects all later samples in windows whose initial state absorbs most of it."""
     off = []
     for seed in range(4):
         recording = flywheel(seed, CVFM(1, [0.35, 0.12]))
@@ -67,14 +67,14 @@ def test_intervals_know_the_noise_of_the_torque():
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
-def test_intervals_know_that_a_joint_reverses_at_once(seed):
-    """Without noise of the torque, the smoothed sign of the fit is the largest error."""
+def test_intervals_include_the_error_of_the_smoothed_sign(seed):
+    """Without torque noise, the smoothed sign of the fit is the largest error."""
     truth = (0.35, 0.12)
     sharp = CVFM(1, truth, v_smooth=1e-5)
     recording = flywheel(seed, sharp, noise=0.0, scheme="time_stepping")
     found = fit(CVFM(1), LinearAxis(0.13), recording, windows=(2.0,), fit_plant=False)
     for i, true in zip(found.intervals, truth, strict=True):
-        # By rounding and steps alone up to 4.6 standard deviations.
+        # By quantisation and steps alone up to 4.6 standard deviations.
         assert abs(i.value - true) < 1.5 * i.sd < 5e-3 * true
 
 
@@ -95,7 +95,7 @@ def stuck_half_the_time(seed: int, friction: dict[str, float]) -> Recording:
 
 
 @pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_intervals_know_that_the_steps_limit_how_steep_the_sign_is(seed):
+def test_intervals_include_the_step_size_limit_of_the_sign(seed):
     true = {"F_c": 0.35, "F_d": 0.2, "F_v": 0.12, "v_s": 0.2}
     settings = {"windows": (0.5,), "fit_plant": False, "encoder_reference": "shared"}
     found = fit("stribeck", Rotor(0.02), stuck_half_the_time(seed, true), **settings)
@@ -105,8 +105,8 @@ def test_intervals_know_that_the_steps_limit_how_steep_the_sign_is(seed):
         assert i.high - i.low < 0.5 * i.value
 
 
-def test_the_noise_of_the_torque_counts_once(monkeypatch):
-    """A fine encoder shows nothing else, so residuals add nothing to what is drawn."""
+def test_torque_noise_counts_once(monkeypatch):
+    """A fine encoder shows nothing else, so residuals add nothing to the samples."""
     tasks, drawn = [], uncertainty.gathered_information
     monkeypatch.setattr(
         "nfriction.fitting.shooting.uncertainty.gathered_information",
@@ -119,7 +119,7 @@ def test_the_noise_of_the_torque_counts_once(monkeypatch):
     torch.testing.assert_close(whole, alone, rtol=0.03, atol=0)
 
 
-def test_noise_by_which_a_simulation_diverges_is_left_out(monkeypatch):
+def test_diverging_noise_samples_are_excluded(monkeypatch):
     axis, model = LinearAxis(0.13), CVFM(1, [0.35, 0.12])
     recording = flywheel(0, model)[:400]
     motion = kalman_smoother(recording.time, recording.q)
@@ -140,24 +140,24 @@ def test_noise_by_which_a_simulation_diverges_is_left_out(monkeypatch):
     assert torque_response(problem, x, 3) is None
 
 
-def test_moved_parameters_move_the_coefficients_so_far():
+def test_predicted_sd_matches_the_change_by_perturbed_parameters():
     torch.manual_seed(0)
     schedule = NFLFM(2, [2e-3, 1e-2]).schedule
     vector = schedule.parameter_vector()
     root = 1e-3 * torch.randn(len(vector), 5, dtype=F64)
     qd, qdd = 5 * torch.randn(2, 3, 2, dtype=F64), 50 * torch.randn(2, 3, 2, dtype=F64)
-    told = CoefficientUncertainty(schedule, root).sd(qd, qdd)
+    predicted = CoefficientUncertainty(schedule, root).sd(qd, qdd)
 
     def at(moved):
         schedule.set_parameter_vector(vector + moved)
         return schedule(qd, qdd).detach()
 
-    # Central differences, right to the square of the step.
+    # Central differences, accurate to second order in the step.
     slopes = torch.stack([(at(0.01 * r) - at(-0.01 * r)) / 0.02 for r in root.T])
-    torch.testing.assert_close(slopes.norm(dim=0), told, rtol=1e-6, atol=0)
+    torch.testing.assert_close(slopes.norm(dim=0), predicted, rtol=1e-6, atol=0)
 
 
-def test_pieces_make_no_difference_and_unknown_parameters_are_told():
+def test_chunks_give_equal_results_and_open_parameters_infinite_sd():
     torch.manual_seed(1)
     schedule = NFLFM(1).schedule
     root = torch.randn(len(schedule.parameter_vector()), 3, dtype=F64)
@@ -172,7 +172,7 @@ def test_pieces_make_no_difference_and_unknown_parameters_are_told():
     assert sd[0].tolist() == [[1.0, 1.0], [1.0, torch.inf]]
 
 
-def test_of_constants_it_says_what_the_intervals_say(fits):
+def test_uncertainty_of_constants_equals_the_intervals(fits):
     law, _ = fits
     rest = torch.zeros(1, dtype=F64)
     sd = law.uncertainty.sd(rest, rest)[0]
@@ -180,7 +180,7 @@ def test_of_constants_it_says_what_the_intervals_say(fits):
         assert interval.high - interval.value == pytest.approx(1.959964 * value)
 
 
-def test_known_friction_lies_within_and_unvisited_motion_is_less_known(fits):
+def test_true_friction_is_covered_and_sd_grows_outside_the_data(fits):
     _, found = fits
     (motion, _) = found.motions
     there = [torch.tensor(x[30::30]) for x in (motion.qd, motion.qdd)]
@@ -191,14 +191,14 @@ def test_known_friction_lies_within_and_unvisited_motion_is_less_known(fits):
     assert (found.uncertainty.sd(never, never)[0, 0] > 1.5 * sd.median(0).values).all()
 
 
-def test_a_network_that_is_not_kept_is_as_sure_as_its_law(fits):
+def test_rejected_network_has_the_uncertainty_of_its_law(fits):
     law, found = fits
-    kept = replace(law, model=found.model)  # as a fit does where the network predicts worse
+    kept = replace(law, model=found.model)  # as in a fit whose network predicts worse
     rest = torch.zeros(3, 1, dtype=F64)
     torch.testing.assert_close(kept.uncertainty.sd(rest, rest), law.uncertainty.sd(rest, rest))
 
 
-def test_the_noise_of_torques_does_not_depend_on_other_recordings():
+def test_torque_noise_does_not_depend_on_other_recordings():
     """Windows of a low sample rate, or of a recording without torque, are padded or zero."""
     random, made = np.random.default_rng(0), []
     for step, noise in ((1e-3, 0.02), (4e-3, 0.05), (1e-3, None)):

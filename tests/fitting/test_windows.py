@@ -1,4 +1,4 @@
-"""Windows cover recordings, restart at their own samples, and pad without weight."""
+"""Windows cover recordings, restart at their own samples, and are padded with zero weight."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_windows_cover_the_recording_without_gaps(length):
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_the_rest_in_which_a_recording_ends_is_in_no_window(noise):
+def test_final_rest_of_a_recording_is_in_no_window(noise):
     time = np.arange(500) * 0.01
     away = np.where(time < 3.0, np.cos(7 * time), np.cos(21.0))
     smooth = np.stack([away, 0.3 + 0 * time], 1)
@@ -67,12 +67,12 @@ def test_the_rest_in_which_a_recording_ends_is_in_no_window(noise):
         at = slice(500 - len(moving), None)
         recording, motion = Recording(time[at], read[at]), Motion(time[at], moving, moving, moving)
         w = cut_windows([recording], [motion], 0.5)
-        # All of a recording without any motion, whose joints are named elsewhere.
+        # This includes recordings without any motion, whose joints are named elsewhere.
         assert w.spans[-1][2] == pytest.approx(last, abs=2)
 
 
 def test_rest_away_from_the_equilibrium_does_not_bias_the_friction():
-    """It creeps under a smoothed sign, which more friction would lessen."""
+    """It creeps under a smoothed sign, which more friction would reduce."""
     plant = PendulumChain([0.5], [0.4], com=[0.2], inertia=[0.004])
     truth = CVFM(1, [[0.04, 0.0008]]).requires_grad_(False)
     recordings = []
@@ -86,7 +86,7 @@ def test_rest_away_from_the_equilibrium_does_not_bias_the_friction():
         assert interval.low < true < interval.high
 
 
-def test_a_subset_keeps_what_belongs_to_its_windows():
+def test_subset_keeps_the_data_of_its_windows():
     recording, motion = made(301, tau=True)
     w = cut_windows([recording], [motion], 0.5)
     chosen = torch.arange(len(w)) % 2 == 0
@@ -108,7 +108,7 @@ def still(samples=301, slope=0.0):
     return zip(*parts, strict=True)
 
 
-def test_recordings_that_begin_at_rest_start_where_the_encoders_stood():
+def test_recordings_that_begin_at_rest_start_at_the_encoder_reading():
     recordings, motions = still()
     smoothed = cut_windows(recordings, motions, 1.0)
     w = cut_windows(recordings, motions, 1.0, rest_speed=0.3)
@@ -125,7 +125,7 @@ def test_recordings_that_begin_at_rest_start_where_the_encoders_stood():
     assert w.subset(torch.arange(len(w)) > 1).at_rest == (1,)
 
 
-def test_what_moves_from_its_first_sample_is_not_at_rest():
+def test_motion_from_the_first_sample_is_not_rest():
     recordings, motions = still(slope=1.0)
     w = cut_windows(recordings, motions, 1.0, rest_speed=0.3)
     assert w.at_rest == (3,)
@@ -152,7 +152,7 @@ def test_windows_too_short_for_a_step_are_refused():
 
 @pytest.mark.filterwarnings("ignore:.*has gaps")
 @pytest.mark.parametrize("length", [0.3, 1.0, 100.0])
-def test_no_window_reaches_over_a_gap(length):
+def test_windows_do_not_span_gaps(length):
     recording, motion = made(301)
     time = recording.time + 2.0 * (np.arange(301) > 120)
     w = cut_windows([Recording(time, recording.q)], [motion], length)
@@ -163,7 +163,7 @@ def test_no_window_reaches_over_a_gap(length):
 
 @pytest.mark.parametrize("held", [0.1, 1.0])
 def test_a_free_motion_is_used_from_its_release(held):
-    """The rest before it is that of a hand; no friction holds a link that moves later."""
+    """Before it, a hand holds the link: friction cannot hold a link that moves later."""
     plant = one_link()
     whole = swing(plant, CVFM(1, [5e-3, 1e-3]), seconds=2.0)
     rows = np.r_[np.zeros(round(held / 2e-3), int), 0 : len(whole)]
@@ -173,12 +173,12 @@ def test_a_free_motion_is_used_from_its_release(held):
     assert found.time[0] == pytest.approx(held, abs=0.02)
     assert released([found])[0] is found
     assert released([whole])[0] is whole
-    # A drive may begin later than the log.
+    # A drive may start later than the log.
     driven = replace(late, tau=np.ones_like(late.q))
     assert released([driven])[0] is driven
 
 
-def test_a_hold_before_the_release_changes_no_fit_and_no_score():
+def test_hold_before_the_release_does_not_affect_fit_and_score():
     plant, truth = one_link(), CVFM(1, [5e-3, 1e-3])
     whole = swing(plant, truth, seconds=3.0)
     rows = np.r_[np.zeros(250, int), 0 : len(whole)]
@@ -191,13 +191,13 @@ def test_a_hold_before_the_release_changes_no_fit_and_no_score():
     )
     scored = score(plant, truth, late, limit=False)
     assert scored.free_run.all < 2e-3
-    # In line with the recording, for figures.
+    # Aligned with the recording, for figures.
     assert scored.simulated.shape == late.q.shape
     assert np.isnan(scored.simulated[:240]).all()
 
 
 @pytest.mark.filterwarnings("ignore:.*held or pushed")
-def test_figures_and_estimators_take_a_recording_that_was_held(tmp_path):
+def test_figures_and_estimators_accept_a_hold_before_the_release(tmp_path):
     plant = one_link()
     whole = swing(plant, CVFM(1, [5e-3, 1e-3]), seconds=2.0)
     rows = np.r_[np.zeros(500, int), 0 : len(whole)]
@@ -218,7 +218,7 @@ def test_a_slow_start_near_upright_is_no_hold(start):
     assert released([slow])[0] is slow
 
 
-def test_a_release_in_the_last_samples_is_left_alone():
+def test_release_in_the_last_samples_is_ignored():
     time = 2e-3 * np.arange(500)
     late = Recording(time, np.maximum(0.0, time - time[-4])[:, None])
     assert released([late])[0] is late

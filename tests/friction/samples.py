@@ -1,4 +1,4 @@
-"""A law of a user's own, and models and motions to test with."""
+"""A user-defined law, and models and motions for tests."""
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ LAWS = (VISCOUS, COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
 
 
 def quadratic(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Linear and quadratic drag, the latter growing with the load."""
+    """Linear and quadratic drag; the latter grows with the load."""
     d1, d2 = coefficients.unbind(-1)
     return d1 * qd + d2 * load * qd * qd.abs()
 
@@ -36,20 +36,20 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def motion(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity, acceleration and load, at times beyond the default trained range."""
+    """Velocity, acceleration and load, partly outside the default trained range."""
     qd, qdd, load = (normal(*shape, seed=3 * seed + i) for i in range(3))
     return 10 * qd, 100 * qdd, load.abs()
 
 
 @torch.no_grad()
 def randomise(model: torch.nn.Module, spread: float = 1.0, seed: int = 0) -> None:
-    """Move every parameter, as training could."""
+    """Change every parameter, as training could."""
     for i, p in enumerate(model.parameters()):
         p.add_(spread * normal(*p.shape, seed=1000 * seed + i).to(p))
 
 
 def named_models(joints: int = 3) -> dict[str, FrictionModel]:
-    """Every named model, moved off its start, and the neuro-fuzzy one with every option."""
+    """Every named model with changed parameters, and the neuro-fuzzy one with every option."""
     models: dict[str, FrictionModel] = {name: model_by_name(name)(joints) for name in model_names()}
     models["NFLFM, other options"] = model_by_name("NFLFM")(
         joints, [1e-3, 2e-3, 1e-3], v_smooth=1e-2, terms=(3, 2), head_units=4,
@@ -61,11 +61,11 @@ def named_models(joints: int = 3) -> dict[str, FrictionModel]:
 
 
 def warming_network() -> FrictionModel:
-    """A neuro-fuzzy model of friction that falls with heat, off its start as a fit moves it."""
+    """A neuro-fuzzy model of friction that falls with heat, with parameters as after a fit."""
     model = model_by_name("NFCVFM")(
         2, [0.1, 0.2, 0.5, 0.0], inputs=["heat"], terms=(3, 2), head_units=2
     )
-    # Not the coefficients of heat, which networks leave as they are.
+    # Not the heat coefficients, which networks do not change.
     lower, upper = model.schedule.bounds()
     moved = torch.where(lower < upper, 0.1 * normal(len(lower)), 0.0)
     model.schedule.set_parameter_vector(moved)

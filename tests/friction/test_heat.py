@@ -28,7 +28,7 @@ def warming(fall: float = 0.8) -> FrictionModel:
 
 
 @pytest.mark.parametrize("make", [warming, warming_network])
-def test_heat_along_a_motion_is_that_of_its_samples(make) -> None:
+def test_heat_along_a_motion_equals_stepping_its_samples(make) -> None:
     model, (qd, qdd, _) = make(), motion(300, 2)
     state = model.initial_state(qd[0], qdd[0])
     assert not state.any()
@@ -38,7 +38,7 @@ def test_heat_along_a_motion_is_that_of_its_samples(make) -> None:
     torch.testing.assert_close(model.schedule.states(qd, qdd), torch.stack(rows))
 
 
-def test_a_constant_power_heats_a_joint_to_its_balance_with_cooling() -> None:
+def test_constant_power_heats_a_joint_to_equilibrium() -> None:
     schedule = HeatedConstant(with_inputs(COULOMB_VISCOUS, ["heat"]), 1, [0.2, 0.1, 0.0, 0.0])
     schedule.set_heat(0.5, 0.3, STEP)
     speed = torch.full((2000, 1), 3.0, dtype=F64)
@@ -51,7 +51,7 @@ def test_a_constant_power_heats_a_joint_to_its_balance_with_cooling() -> None:
 
 
 @pytest.mark.parametrize("make", [warming, warming_network])
-def test_friction_falls_by_the_exponential_of_heat(make) -> None:
+def test_friction_falls_exponentially_with_heat(make) -> None:
     model, (qd, qdd, normal) = make(), motion(50, 2)
     cold = model(qd, qdd, normal)
     heat = torch.full((50, 2, 1), 0.7, dtype=F64)
@@ -62,7 +62,7 @@ def test_friction_falls_by_the_exponential_of_heat(make) -> None:
 
 
 @pytest.mark.slow
-def test_compiled_and_eager_rollouts_heat_alike_and_lose_less_than_cold_friction() -> None:
+def test_compiled_and_eager_heat_agree_and_dissipate_less_than_cold() -> None:
     start = torch.tensor([2.0, 0.5], dtype=F64)
     plant = pendulum(normal_load="bearing")
     given = {"sample_time": STEP, "steps": 1500, "gradients": False}
@@ -76,7 +76,7 @@ def test_compiled_and_eager_rollouts_heat_alike_and_lose_less_than_cold_friction
     assert runs[0].qd[late].square().sum() > 1.1 * cold.qd[late].square().sum()
 
 
-def test_a_motion_continues_with_the_heat_that_it_had() -> None:
+def test_motion_continues_with_its_last_heat() -> None:
     plant, model = pendulum(normal_load="bearing"), warming()
     start = torch.tensor([2.0, 0.5], dtype=F64)
     given = {"sample_time": STEP, "gradients": False}
@@ -84,16 +84,16 @@ def test_a_motion_continues_with_the_heat_that_it_had() -> None:
     heat = model.schedule.states(whole.qd, whole.qdd)
     half = rollout(plant, model, whole.q[500], whole.qd[500], steps=500,
                    hidden_state=heat[500], **given)  # fmt: skip
-    # The acceleration of the first sample is another, and heat needs none.
+    # The acceleration of the first sample differs, and heat does not use it.
     torch.testing.assert_close(half.q[-1], whole.q[-1], rtol=0, atol=1e-9)
 
 
-def test_heat_follows_the_time_of_samples() -> None:
+def test_heat_uses_the_time_stamps() -> None:
     model, (qd, qdd, _) = warming(), motion(300, 2)
     time = STEP * torch.arange(300, dtype=F64)
     regular = model.schedule.states(qd, qdd)
     torch.testing.assert_close(model.schedule.states(qd, qdd, time), regular)
-    # In a gap of 4 s joints cool.
+    # Joints cool in a gap of 4 s.
     late = time + 4.0 * (torch.arange(300) >= 200)
     found = model.schedule.states(qd, qdd, late)
     torch.testing.assert_close(found[:200], regular[:200])
@@ -104,7 +104,7 @@ def test_heat_follows_the_time_of_samples() -> None:
     assert (slow[-1] > 1.2 * regular[-1]).all()
 
 
-def test_a_simulation_heats_alike_at_any_sample_time() -> None:
+def test_simulated_heat_is_independent_of_the_sample_time() -> None:
     plant, model = pendulum(normal_load="bearing"), warming()
     start = torch.tensor([2.0, 0.5], dtype=F64)
     ends = [
@@ -122,7 +122,7 @@ def test_a_simulation_heats_alike_at_any_sample_time() -> None:
     assert sum(p.grad.abs().sum() for p in model.parameters()) > 0
 
 
-def test_friction_that_drives_does_not_cool() -> None:
+def test_negative_dissipation_does_not_cool() -> None:
     law = with_inputs(COULOMB_VISCOUS, ["direction", "heat"])
     schedule = HeatedConstant(law, 1, [0.02, 0.0, 2.0, 0.5, 0.0])
     schedule.set_heat(0.01, 1.0, STEP)
@@ -131,7 +131,7 @@ def test_friction_that_drives_does_not_cool() -> None:
     assert not schedule.advance(backwards[0], backwards[0], torch.zeros(1, 1, dtype=F64)).any()
 
 
-def test_the_fall_of_a_joint_without_heat_stays_where_a_fit_left_it() -> None:
+def test_heat_coefficient_of_a_cold_joint_is_kept() -> None:
     model = NFCVFM(1, inputs=["heat"])
     model.schedule.set_reference(
         torch.tensor([[1.0, 0.1, 1e-12, 0.0]], dtype=F64),
@@ -140,7 +140,7 @@ def test_the_fall_of_a_joint_without_heat_stays_where_a_fit_left_it() -> None:
     assert float(model.schedule.reference_coefficients()[0, 2]) < 2e-6
 
 
-def test_a_model_file_keeps_the_heat(tmp_path) -> None:
+def test_model_file_keeps_the_heat_settings(tmp_path) -> None:
     model = warming_network()
     again = load(save(model, tmp_path / "m.json"))
     assert again.schedule.heat_capacity.tolist() == pytest.approx([3.0, 4.0])
@@ -157,12 +157,12 @@ def test_a_model_file_whose_heat_overflows_is_refused(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("given", [(0.0, 1.0, 1.0), (1.0, math.nan, 1.0), (1.0, 1.0, -1.0)])
-def test_heat_is_refused_where_a_constant_is_not_positive(given) -> None:
+def test_heat_constants_must_be_positive(given) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         warming().schedule.set_heat(*given)
 
 
-def test_initial_values_may_be_those_of_the_law_alone() -> None:
+def test_initial_values_of_heat_coefficients_may_be_omitted() -> None:
     model = NFCVFM(2, [0.1, 0.2], inputs=["load", "heat"])
     expected = torch.tensor([0.1, 0.2, 0.0, 0.0, 0.0], dtype=F64).expand(2, -1)
     found = model.schedule.reference_coefficients()
@@ -177,10 +177,10 @@ def test_a_capacity_for_another_number_of_joints_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["heat", "position"])
-def test_the_papers_network_refuses_inputs_that_a_fit_has_to_find(name) -> None:
+def test_paper_network_refuses_inputs_that_need_a_fit(name) -> None:
     with pytest.raises(ValueError, match=f'"{name}" needs `network="anfis"`'):
         NFCVFM(1, network="rbf", inputs=[name])
 
 
-def test_without_heat_nothing_is_remembered() -> None:
+def test_without_heat_there_is_no_hidden_state() -> None:
     assert NFCVFM(2, inputs=["load"]).state_size == CVFM(2).state_size == 0

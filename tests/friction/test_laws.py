@@ -1,4 +1,4 @@
-"""Friction laws: odd, passive, smooth through zero, broadcasting; and what describes them."""
+"""Friction laws: odd, passive, smooth through zero, broadcasting; and their descriptions."""
 
 import copy
 import itertools
@@ -31,7 +31,7 @@ positive = st.floats(0, 1e3)
 
 
 def positive_coefficients(law: Law, *shape: int, seed: int = 0) -> Tensor:
-    """Random coefficients with an offset, where there is one, of zero."""
+    """Random coefficients; an offset, if the law has one, is zero."""
     values = normal(*shape, len(law.names), seed=seed).exp()
     signed = torch.tensor([not c.positive for c in law.coefficients])
     return values.masked_fill(signed, 0.0)
@@ -39,11 +39,11 @@ def positive_coefficients(law: Law, *shape: int, seed: int = 0) -> Tensor:
 
 @every_law
 @given(data=st.data())
-def test_friction_without_an_offset_never_drives(law: Law, data: st.DataObject) -> None:
+def test_friction_without_an_offset_is_passive(law: Law, data: st.DataObject) -> None:
     qd, load = (data.draw(st.floats(-1e3, 1e3)), data.draw(positive))
     values = [data.draw(positive) if c.positive else 0.0 for c in law.coefficients]
     for k, c in enumerate(law.coefficients):
-        if c.name == "v_s":  # a width; a schedule never gives zero
+        if c.name == "v_s":  # a width; no schedule returns zero
             values[k] += 1e-12
     qd, load, coefficients = (torch.tensor(v, dtype=torch.float64) for v in (qd, load, values))
     power = qd * law.torque(qd, load, coefficients, V_SMOOTH)
@@ -65,8 +65,8 @@ def test_the_offset_is_the_torque_at_rest() -> None:
 
 
 @every_law
-def test_gradients_are_those_of_differences_at_and_around_rest(law: Law) -> None:
-    # v_smooth of the steps' size would make the differences inaccurate, not the gradients.
+def test_gradients_equal_finite_differences_at_and_around_rest(law: Law) -> None:
+    # A v_smooth as small as the step would make the differences inaccurate, not the gradients.
     qd = torch.tensor([0.0, -0.0, 0.05, -2.0], dtype=torch.float64, requires_grad=True)
     load = torch.tensor([1.0, 0.5, 0.0, 2.0], dtype=torch.float64, requires_grad=True)
     coefficients = positive_coefficients(law, 4).requires_grad_()
@@ -78,7 +78,7 @@ def test_gradients_are_those_of_differences_at_and_around_rest(law: Law) -> None
 
 
 @every_law
-def test_gradients_stay_finite_where_functions_overflow(law: Law) -> None:
+def test_gradients_stay_finite_if_intermediate_values_overflow(law: Law) -> None:
     speeds = torch.tensor([0.0, 1e-300, -1e-8, 1.0, 1e3, -1e6], dtype=torch.float64)
     sizes = torch.tensor([1e-12, 1e-3, 1.0, 1e3], dtype=torch.float64)
     qd = speeds[:, None].expand(6, 4).clone().requires_grad_()
@@ -89,7 +89,7 @@ def test_gradients_stay_finite_where_functions_overflow(law: Law) -> None:
 
 
 @every_law
-def test_a_batch_of_coefficients_is_each_of_them(law: Law) -> None:
+def test_batched_coefficients_equal_single_ones(law: Law) -> None:
     qd, _, load = motion(7, 3)
     many = positive_coefficients(law, 5, 1, 3)
     together = law.torque(qd, load, many, V_SMOOTH)
@@ -104,7 +104,7 @@ def test_dtype_follows_the_inputs(law: Law) -> None:
     assert law.torque(qd, qd, torch.ones(3, len(law.names)), V_SMOOTH).dtype == torch.float32
 
 
-def test_coulomb_friction_grows_with_the_load_alone() -> None:
+def test_coulomb_friction_grows_only_with_the_load() -> None:
     qd, _, load = motion(50, 2)
     coefficients = torch.tensor([0.0, 0.7], dtype=torch.float64)
     expected = 0.7 * load * smooth_sign(qd, V_SMOOTH)
@@ -140,18 +140,18 @@ def test_stribeck_falls_from_breakaway_to_coulomb_friction() -> None:
     assert torque(20 * v_s) == pytest.approx(f_c, rel=1e-12)
     assert torque(20 * v_s, f_v=0.3) == pytest.approx(f_c + 0.3 * 20 * v_s, rel=1e-12)
     for delta in (0.5, 1.0, 2.0, 50.0):
-        # At v_s a share 1/e is left, whatever the exponent.
+        # At v_s a share of 1/e remains, whatever the exponent.
         assert torque(v_s, delta) == pytest.approx(f_c + f_d / torch.e, rel=1e-9)
     speeds = torch.logspace(-5, 1, 50).tolist()
     torques = [torque(v) for v in speeds]
     assert all(a >= b for a, b in itertools.pairwise(torques))
 
 
-def test_the_exponent_of_stribeck_is_kept_by_default() -> None:
+def test_stribeck_exponent_is_fixed_by_default() -> None:
     assert [c.name for c in STRIBECK.coefficients if not c.fitted] == ["delta"]
 
 
-def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
+def test_laws_unsuitable_for_fits_or_files_are_refused() -> None:
     with pytest.raises(ValueError, match="initial_grid"):
         Coefficient("v_s", "rad/s", linear=False)
     with pytest.raises(ValueError, match="`prior_scale` of 'v_s' must be positive, and is for"):
@@ -164,7 +164,7 @@ def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
         Law("none", (), linear)
 
 
-def test_a_law_names_what_it_shares_with_a_simpler_one():
+def test_law_names_the_coefficients_of_its_nested_law():
     own = (Coefficient("a", "N m"), Coefficient("b", "N m s/rad"))
     assert Law("more", own, coulomb_viscous, LINEAR, ("b", "a")).nested_coefficients == ("b", "a")
     wrong = ((), ("a",), ("a", "c"), ("a", "b", "a"))
@@ -173,7 +173,7 @@ def test_a_law_names_what_it_shares_with_a_simpler_one():
             Law("more", own, coulomb_viscous, simpler, shared)
 
 
-def test_a_law_refuses_a_simpler_one_that_it_cannot_follow():
+def test_law_refuses_a_nested_law_that_it_cannot_represent():
     with pytest.raises(TypeError, match="`nested_law` must be a Law, got 'linear'"):
         Law("more", (Coefficient("a", "N m"),), coulomb_viscous, "linear", ("a",))
     signed = Law("signed", (Coefficient("o", "N m", positive=False),), coulomb)
@@ -182,7 +182,7 @@ def test_a_law_refuses_a_simpler_one_that_it_cannot_follow():
 
 
 @pytest.mark.parametrize("law", [NONLINEAR, STRIBECK])
-def test_a_law_is_the_simpler_one_where_nothing_else_is_left(law):
+def test_law_equals_its_nested_law_if_other_terms_are_zero(law):
     simpler = law.nested_law
     qd, load = torch.linspace(-3, 3, 7, dtype=torch.float64), torch.ones(7, dtype=torch.float64)
     values = torch.tensor([0.3, 0.2], dtype=torch.float64)
@@ -194,20 +194,20 @@ def test_a_law_is_the_simpler_one_where_nothing_else_is_left(law):
     )
 
 
-def test_a_description_of_another_type_is_refused() -> None:
+def test_description_of_wrong_type_is_refused() -> None:
     for wrong in (Coefficient("B", "N m"), ["B"], [Coefficient("B", "N m")]):
         with pytest.raises(TypeError, match="`coefficients` of law 'odd' must be a tuple of"):
             Law("odd", wrong, coulomb)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("start", [-1.0, 0.0, float("nan"), float("inf")])
-def test_start_values_are_possible_ones(start: float) -> None:
+def test_initial_values_are_within_bounds(start: float) -> None:
     with pytest.raises(ValueError, match="`initial_grid` of 'v_s' must be positive and finite"):
         Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0, start))
 
 
 def test_copies_of_a_model_share_its_law() -> None:
-    """Fits copy their model at every search; a law cannot change."""
+    """Fits copy their model in every search; a law is immutable."""
     model = LFM(1)
     again = copy.deepcopy(model)
     assert again.law is model.law

@@ -1,4 +1,4 @@
-"""Laws with memory: exact, passive, without drift at rest, with closed loops of hysteresis."""
+"""Laws with memory: exact, passive, without drift at rest, with closed hysteresis loops."""
 
 import math
 
@@ -65,7 +65,7 @@ def held(law: Law, state: Tensor, qd: float, dt: float, c: Tensor) -> Tensor:
 
 
 @every_law
-def test_energy_is_never_injected_from_a_million_states(law: Law) -> None:
+def test_no_energy_is_injected_from_a_million_random_states(law: Law) -> None:
     generator = torch.Generator().manual_seed(0)
     count = 1_000_000
 
@@ -79,7 +79,7 @@ def test_energy_is_never_injected_from_a_million_states(law: Law) -> None:
     state = spread(-8.0, 2.0, law.state_size) * torch.randn(
         count, 1, law.state_size, generator=generator, dtype=torch.float64
     )
-    # Of either sign, as a gear's is: it may change from sample to sample in any way.
+    # Of either sign, as a gear's load is: it may change arbitrarily from sample to sample.
     load = sign.roll(1) * spread(-3.0, 3.0)
     after = memory(law).advance(state, qd, load, coefficients, dt)
     work = memory(law).torque(after, qd, load, coefficients) * qd * dt
@@ -90,7 +90,7 @@ def test_energy_is_never_injected_from_a_million_states(law: Law) -> None:
 
 @every_law
 @given(data=st.data())
-def test_energy_is_never_injected(law: Law, data: st.DataObject) -> None:
+def test_no_energy_is_injected_along_a_motion(law: Law, data: st.DataObject) -> None:
     c = torch.tensor(
         [[10.0 ** data.draw(st.floats(-6, 6)) for _ in law.names]], dtype=torch.float64
     )
@@ -107,7 +107,7 @@ def test_energy_is_never_injected(law: Law, data: st.DataObject) -> None:
 
 @every_law
 @pytest.mark.parametrize("qd", [2e-3, -2e-3, 1e-5, 0.5])
-def test_a_held_velocity_is_solved_exactly(law: Law, qd: float) -> None:
+def test_constant_velocity_within_a_sample_is_solved_exactly(law: Law, qd: float) -> None:
     # From a deflection against the motion, through the elastic range into sliding.
     c, own = typical(law), memory(law)
     start = torch.full((1, law.state_size), -2e-6 * math.copysign(1.0, qd), dtype=torch.float64)
@@ -155,7 +155,7 @@ def test_a_joint_at_rest_keeps_its_state(law: Law) -> None:
 
 
 @every_law
-def test_a_constant_velocity_ends_at_the_steady_torque(law: Law) -> None:
+def test_constant_velocity_converges_to_the_steady_torque(law: Law) -> None:
     c, own, one = typical(law), memory(law), torch.ones(1, dtype=torch.float64)
     for qd in (-0.3, 1e-3, 0.02):
         v = torch.full((1,), qd, dtype=torch.float64)
@@ -169,9 +169,9 @@ def test_a_constant_velocity_ends_at_the_steady_torque(law: Law) -> None:
     "law", [pytest.param(ELASTO_PLASTIC, marks=pytest.mark.slow), maxwell_slip(4)],
     ids=lambda law: law.name,
 )  # fmt: skip
-def test_a_load_below_breakaway_that_trembles_does_not_creep(law: Law) -> None:
-    # Slowly to half the least breakaway, then sixty small swings: an elastic contact ends
-    # where it began, a LuGre bristle slips a little with each swing.
+def test_oscillating_load_below_breakaway_does_not_creep(law: Law) -> None:
+    # Slowly to half the smallest breakaway, then sixty small swings: an elastic contact ends where
+    # it began, a LuGre bristle slips a little with each swing.
     reach = 0.5 * (0.7e-5 if law is ELASTO_PLASTIC else 1e-4)
     swing = 0.5 * torch.sin(2.0 * math.pi * torch.arange(1, 41, dtype=torch.float64) / 40)
     rise = torch.linspace(0.0, 1.0, 100, dtype=torch.float64)
@@ -183,7 +183,7 @@ def test_a_load_below_breakaway_that_trembles_does_not_creep(law: Law) -> None:
 
 
 def test_closed_inner_loops_return_to_the_point_they_left() -> None:
-    # Non-local memory: after an inner loop the outer branch goes on as if it had not been.
+    # Non-local memory: after an inner loop the outer branch continues as if there were none.
     law = maxwell_slip(4)
     outer = torch.linspace(0.0, 4e-3, 401, dtype=torch.float64)
     inner = torch.cat([outer[:201], outer[120:200].flip(0), outer[121:201], outer[201:]])
@@ -195,7 +195,7 @@ def test_closed_inner_loops_return_to_the_point_they_left() -> None:
 
 @every_law
 def test_a_stiff_contact_is_stable_at_a_millisecond(law: Law) -> None:
-    # An explicit step has a growth of sigma_0 |qd| dt / g, here 500.
+    # An explicit step has an amplification of sigma_0 |qd| dt / g, here 500.
     c, dt = typical(law), 1e-3
     t = torch.arange(2000, dtype=torch.float64) * dt
     path = 0.05 * torch.sin(2 * math.pi * 2 * t)
@@ -228,12 +228,13 @@ def test_batches_broadcast_and_gradients_are_finite_at_rest(law: Law) -> None:
     assert torque.shape == qd.shape
     slopes = torch.autograd.grad(torque.sum(), (state, qd, c))
     assert all(torch.isfinite(x).all() for x in slopes)
-    # At rest the contact is a spring: over a sample its slope is the stiffness times its length.
+    # At rest the contact is a spring: over a sample its slope is the stiffness times the sample
+    # time.
     stiffness = stored(law, torch.ones(law.state_size), typical(law)) * 2.0
     assert (slopes[1][..., 0] >= 0.99e-3 * stiffness).all()
 
 
-def test_a_number_of_elements_that_is_none_is_refused() -> None:
+def test_invalid_number_of_elements_is_refused() -> None:
     for elements in (0, 2.5, 101):
         with pytest.raises(ValueError, match="`elements` must be a whole number from 1 to 100"):
             maxwell_slip(elements)  # type: ignore[arg-type]
@@ -248,7 +249,7 @@ def test_models_with_memory_have_names() -> None:
         assert kind(3).law.state_size == kind(3).law_state_size > 0
 
 
-def test_what_has_no_state_yet_refuses_such_a_law() -> None:
+def test_parts_without_hidden_state_refuse_laws_with_memory() -> None:
     model, rest = LuGre(1), torch.zeros(1, dtype=torch.float64)
     with pytest.raises(ValueError, match="has an internal state"):
         model(rest, rest, rest)

@@ -1,4 +1,4 @@
-"""Friction models: law times schedule, one of a user's own included."""
+"""Friction models: law times schedule, including user-defined ones."""
 
 import re
 
@@ -31,7 +31,7 @@ def test_the_torque_is_the_law_of_the_coefficients(name: str) -> None:
 
 
 @every_model
-def test_any_batch_shape_is_samples(name: str) -> None:
+def test_any_batch_shape_is_accepted(name: str) -> None:
     model = named_models()[name]
     inputs = motion(4, 5, 3)
     flat = model(*(x.reshape(-1, 3) for x in inputs))
@@ -40,14 +40,14 @@ def test_any_batch_shape_is_samples(name: str) -> None:
 
 
 @every_model
-def test_double_precision_throughout_and_single_where_asked(name: str) -> None:
+def test_precision_is_double_by_default_and_single_on_request(name: str) -> None:
     model = named_models()[name]
     assert all(t.dtype == torch.float64 for t in model.state_dict().values())
     qd, qdd, load = motion(20, 3)
     expected = model(qd, qdd, load)
     single = model.to(torch.float32)(qd.float(), qdd.float(), load.float())
     assert single.dtype == torch.float32
-    # Single precision's 1e-7, times what scaling, exponentials and sums add.
+    # Single precision's 1e-7, times the effect of scaling, exponentials and sums.
     torch.testing.assert_close(single.double(), expected, rtol=1e-3, atol=1e-4)
 
 
@@ -62,30 +62,30 @@ def test_every_trained_parameter_has_a_gradient(name: str) -> None:
 
 
 @every_model
-def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
+def test_zero_velocity_damping_equals_finite_differences(name: str) -> None:
     model = named_models()[name]
     rest, load = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     step = 1e-5 * model.v_smooth
-    # Of every set of coefficients that may hold at rest, the steepest counts.
+    # Of all sets of coefficients possible at rest, the steepest counts.
     held = model.schedule.rest_coefficients()
     ahead, behind = (model.torque(rest + s, load, held) for s in (step, -step))
     slope = model.zero_velocity_damping()
     assert slope.shape == (3,)
     expected = ((ahead - behind) / (2 * step)).detach().reshape(-1, 3).amax(0)
-    # Truncation is (step / v_smooth)^2 / 3, and step / v_s where Stribeck's exponent is near 1.
+    # Truncation is (step / v_smooth)^2 / 3, and step / v_s if Stribeck's exponent is near 1.
     torch.testing.assert_close(slope, expected, rtol=1e-6, atol=0)
     assert slope.shape == (3,)
     assert not slope.requires_grad
 
 
-def test_the_slope_of_coulomb_friction_is_its_size_over_the_smoothing() -> None:
+def test_damping_of_coulomb_friction_is_its_size_over_v_smooth() -> None:
     model = LFM(2, [[0.1, 0.5], [0.2, 0.7]], v_smooth=1e-2)
     expected = torch.tensor([0.1 + 0.5e2, 0.2 + 0.7e2], dtype=torch.float64)
     torch.testing.assert_close(model.zero_velocity_damping(), expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
-def test_a_law_of_ones_own_works_like_the_named_ones(make: type[Schedule]) -> None:
+def test_user_defined_law_works_like_the_named_ones(make: type[Schedule]) -> None:
     values = torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64)
     model = FrictionModel(QUADRATIC, make(QUADRATIC, 2, values))
     qd, qdd, load = motion(30, 2)
@@ -95,7 +95,7 @@ def test_a_law_of_ones_own_works_like_the_named_ones(make: type[Schedule]) -> No
 
 
 class WithoutParameters(Schedule):
-    """A schedule of a user's own: viscous friction that falls with the speed."""
+    """A user-defined schedule: viscous friction that falls with the speed."""
 
     def forward(self, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
         return torch.exp(-qd.abs()).unsqueeze(-1)
@@ -113,14 +113,14 @@ class WithoutParameters(Schedule):
         raise NotImplementedError
 
 
-def test_a_schedule_of_ones_own_works_even_without_parameters() -> None:
+def test_user_defined_schedule_works_even_without_parameters() -> None:
     model = FrictionModel(VISCOUS, WithoutParameters(VISCOUS, 2))
     qd, qdd, load = motion(30, 2)
     torch.testing.assert_close(model(qd, qdd, load), torch.exp(-qd.abs()) * qd)
     torch.testing.assert_close(model.zero_velocity_damping(), torch.ones(2, dtype=torch.float64))
 
 
-def test_held_coefficients_come_in_batches() -> None:
+def test_constant_coefficients_may_be_batched() -> None:
     model = NLFM(3)
     qd, _, load = motion(7, 3)
     held = normal(4, 7, 3, 5).exp()
@@ -129,14 +129,14 @@ def test_held_coefficients_come_in_batches() -> None:
         torch.testing.assert_close(model.torque(qd, load, one), torque, rtol=1e-14, atol=0)
 
 
-def test_nan_in_nan_out() -> None:
+def test_nan_inputs_give_nan_outputs() -> None:
     for name, model in named_models().items():
         for which in range(3):
             inputs = list(motion(4, 3))
             clean = model(*inputs)
             changed = clean.clone()
             changed[1, 2] = torch.nan
-            # What a model does not read cannot harm it; far from rest a sign reads nothing.
+            # Inputs that a model does not use have no effect; far from rest nor does the sign.
             slow = [1e-4 * x if i == 0 else x for i, x in enumerate(motion(3))]
             reads = torch.autograd.functional.jacobian(
                 lambda x, w=which, m=model, s=slow: m(
@@ -158,7 +158,7 @@ def test_nan_in_nan_out() -> None:
         ("NFLFM", "network 'anfis'", "network, inputs, terms", {}),
     ],
 )
-def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None:
+def test_unknown_option_of_a_model_is_named(name, of, known, options) -> None:
     with pytest.raises(ValueError, match=f"{of} has no option depth; it has {known}"):
         model_by_name(name)(2, depth=3, **options)
 
@@ -179,7 +179,7 @@ def test_wrong_options_of_a_network_are_named(given, words) -> None:
         model_by_name("NFLFM")(2, **given)
 
 
-def test_options_are_those_given() -> None:
+def test_options_are_returned_as_given() -> None:
     options = {
         "terms": [3, 2],
         "head_units": 4,
@@ -189,11 +189,11 @@ def test_options_are_those_given() -> None:
     }
     assert NFLFM(2, **options).schedule.options() == options
     assert LFM(2).schedule.options() == {}
-    # Made by hand, a model still tells them.
+    # A manually built model returns them, too.
     assert FrictionModel(LINEAR, NeuroFuzzy(LINEAR, 2, **options)).schedule.options() == options
 
 
-def test_the_number_of_joints_must_fit() -> None:
+def test_number_of_joints_must_match() -> None:
     with pytest.raises(ValueError, match="3 joints, got last axis 2"):
         LFM(3)(*motion(5, 2))
     qd, qdd, load = motion(1, 3)
@@ -203,7 +203,7 @@ def test_the_number_of_joints_must_fit() -> None:
 
 
 @pytest.mark.parametrize("v_smooth", [0.0, -1.0, float("nan"), float("inf")])
-def test_the_smoothing_must_be_positive(v_smooth: float) -> None:
+def test_v_smooth_must_be_positive(v_smooth: float) -> None:
     with pytest.raises(ValueError, match="`v_smooth` must be positive and finite"):
         LFM(1, v_smooth=v_smooth)
 
@@ -229,12 +229,12 @@ def test_models_are_found_by_name() -> None:
         ("adaptive:arctn", "adaptive:arctan (ANLFM)"),
     ],
 )
-def test_a_mistyped_name_gets_the_nearest_one(asked: str, meant: str) -> None:
+def test_mistyped_name_suggests_the_nearest_one(asked: str, meant: str) -> None:
     with pytest.raises(ValueError, match=re.escape(f"did you mean {meant}?")):
         model_by_name(asked)
 
 
-def test_plain_names_say_the_law_and_what_its_coefficients_follow() -> None:
+def test_plain_names_name_law_and_inputs() -> None:
     plain = {name: plain_name(name) for name in model_names()}
     assert len(set(plain.values())) == len(plain)
     constant = {model_by_name(n).definition: p for n, p in plain.items() if ":" not in p}
@@ -249,14 +249,14 @@ def test_plain_names_say_the_law_and_what_its_coefficients_follow() -> None:
         }[before]  # fmt: skip
 
 
-def test_names_are_read_in_any_case_of_letters() -> None:
+def test_names_are_case_insensitive() -> None:
     for name in model_names():
         for text in (name, plain_name(name)):
             forms = (text.upper(), text.lower(), text.title(), f" {text} ", text.replace("-", "_"))
             assert {model_name(form) for form in forms} == {name}
 
 
-def test_arrays_and_lists_are_inputs_too() -> None:
+def test_arrays_and_lists_are_accepted_as_inputs() -> None:
     for name, model in named_models(2).items():
         motion = [[0.5, -1.0]], [[3.0, 20.0]], [[1.0, 0.5]]
         tensors = [torch.tensor(x, dtype=torch.float64) for x in motion]
@@ -268,7 +268,7 @@ def test_arrays_and_lists_are_inputs_too() -> None:
 
 
 @pytest.mark.parametrize("value", [10**400, "fast", None, [1e-3, 1e-3]])
-def test_numbers_beyond_every_float_are_refused_by_name(value: object) -> None:
+def test_numbers_beyond_float_range_are_refused_by_name(value: object) -> None:
     with pytest.raises(ValueError, match="`v_smooth` must be positive and finite"):
         LFM(1, v_smooth=value)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`prior_sd` must be positive and finite"):
@@ -279,7 +279,7 @@ def test_numbers_beyond_every_float_are_refused_by_name(value: object) -> None:
 
 
 @every_model
-def test_the_slope_at_rest_is_known_without_gradients_too(name: str) -> None:
+def test_zero_velocity_damping_works_without_gradients(name: str) -> None:
     expected = named_models()[name].zero_velocity_damping()
     with torch.no_grad():
         assert torch.equal(named_models()[name].zero_velocity_damping(), expected)
@@ -288,7 +288,7 @@ def test_the_slope_at_rest_is_known_without_gradients_too(name: str) -> None:
         assert torch.equal(model.zero_velocity_damping(), expected)
 
 
-def test_what_is_no_number_is_refused_by_name() -> None:
+def test_values_that_are_no_numbers_are_refused_by_name() -> None:
     for wrong in ("fast", None, [[1.0], [1.0, 2.0]], [10**400, 1.0], np.array([1j, 1.0])):
         with pytest.raises(ValueError, match=r"^load must be an array of numbers, got"):
             LFM(2)([1.0, 2.0], [0.0, 0.0], wrong)
@@ -304,7 +304,7 @@ def test_the_network_has_two_inputs(terms: object) -> None:
         NFLFM(1, terms=terms)
 
 
-def test_models_are_offered_for_what_they_can_be_fitted_to() -> None:
+def test_models_are_offered_for_data_that_they_can_be_fitted_to() -> None:
     of_motions, of_tables = (re.split(r"[ ,;()]+", model_list(of_tables=x)) for x in (False, True))
     assert "maxwell-slip" in of_motions
     assert not {"slip", "load-slip"} & set(of_motions)

@@ -1,4 +1,4 @@
-"""Neuro-fuzzy coefficients: a constant law until trained, and beyond what it was trained on."""
+"""Neuro-fuzzy coefficients equal a constant law until trained, and outside the trained range."""
 
 import copy
 import pickle
@@ -32,7 +32,7 @@ def trained(law=LINEAR, joints: int = 2, spread: float = 0.5, seed: int = 0, **o
 
 
 @every_law
-def test_untrained_it_is_the_constant_law(law) -> None:
+def test_untrained_network_equals_the_constant_law(law) -> None:
     constant = Constant(law, 3)
     schedule = NeuroFuzzy(law, 3, constant.values)
     qd, qdd, _ = motion(100, 3)
@@ -58,7 +58,7 @@ def test_a_signed_coefficient_of_zero_starts_at_zero() -> None:
 @every_law
 @settings(max_examples=20)
 @given(seed=st.integers(0, 1000), spread=st.floats(0.01, 100.0))
-def test_coefficients_are_positive_whatever_the_parameters(law, seed: int, spread: float):
+def test_coefficients_are_positive_for_any_parameters(law, seed: int, spread: float):
     schedule = trained(law, 2, spread, seed)
     values = schedule(*motion(50, 2, seed=seed)[:2])
     assert torch.isfinite(values).all()
@@ -69,7 +69,7 @@ def test_coefficients_are_positive_whatever_the_parameters(law, seed: int, sprea
 @both_ways
 @settings(max_examples=20)
 @given(seed=st.integers(0, 1000), spread=st.floats(0.01, 10.0))
-def test_without_an_offset_it_never_drives(law, acceleration: str, seed: int, spread: float):
+def test_without_an_offset_friction_is_passive(law, acceleration: str, seed: int, spread: float):
     schedule = trained(law, 2, spread, seed, acceleration=acceleration)
     silence_offset(schedule)
     qd, qdd, load = motion(50, 2, seed=seed)
@@ -86,7 +86,7 @@ def silence_offset(schedule: NeuroFuzzy) -> None:
 
 
 @every_law
-def test_turning_the_other_way_only_turns_the_torque(law) -> None:
+def test_reversed_velocity_only_reverses_the_torque(law) -> None:
     schedule = trained(law)
     silence_offset(schedule)
     model = FrictionModel(law, schedule)
@@ -94,7 +94,7 @@ def test_turning_the_other_way_only_turns_the_torque(law) -> None:
     assert torch.equal(model(-qd, -qdd, load), -model(qd, qdd, load))
 
 
-def test_with_signed_acceleration_the_directions_differ() -> None:
+def test_signed_acceleration_makes_directions_differ() -> None:
     schedule = trained(acceleration="signed")
     qd, qdd, _ = motion(100, 2)
     assert not torch.allclose(schedule(-qd, -qdd), schedule(qd, qdd), rtol=1e-3)
@@ -102,12 +102,12 @@ def test_with_signed_acceleration_the_directions_differ() -> None:
 
 
 @both_ways
-def test_beyond_the_trained_range_coefficients_return_to_the_constant_law(acceleration: str):
+def test_coefficients_return_to_the_constant_law_outside_the_range(acceleration: str):
     schedule = trained(acceleration=acceleration)
     schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
     law = schedule.reference_coefficients()
     edge = torch.tensor([4.0, 5.0], dtype=torch.float64), torch.tensor([60.0, 20.0]).double()
-    # Half the range beyond it, of velocity in one joint and of acceleration in the other.
+    # Half the range beyond it, in velocity for one joint and in acceleration for the other.
     far = torch.tensor([6.0, 5.0], dtype=torch.float64), torch.tensor([60.0, 40.0]).double()
     farther = torch.tensor([400.0, 5.1], dtype=torch.float64), torch.tensor([61.0, 1e9]).double()
     assert (schedule(*edge) != law).all()
@@ -121,13 +121,13 @@ def test_beyond_the_trained_range_coefficients_return_to_the_constant_law(accele
 
 
 @both_ways
-def test_the_nearest_trained_motion(acceleration: str) -> None:
+def test_nearest_trained_motion_is_found(acceleration: str) -> None:
     schedule = trained(acceleration=acceleration)
     schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
     qd, qdd = 10 * normal(200, 2), 100 * normal(200, 2, seed=1)
     qd[:50] *= 1e-3
     nearest = schedule.within_range(qd, qdd)
-    # What is near is left alone, and nothing nearer than the clamped inputs is found.
+    # Motion close to the range is unchanged, and no point is nearer than the clamped inputs.
     scaled = schedule.scaled(qd, qdd)
     torch.testing.assert_close(schedule.scaled(*nearest), scaled.clamp(0, 1))
     rest = torch.zeros(1, 2, dtype=torch.float64), qdd[:1]
@@ -147,7 +147,7 @@ def test_an_empty_range_is_refused(velocity: float, acceleration: list[float]) -
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_nan_of_one_sample_and_joint_stays_there(which: int) -> None:
+def test_nan_affects_only_its_sample_and_joint(which: int) -> None:
     schedule = trained()
     inputs = list(motion(5, 2)[:2])
     clean = schedule(*inputs)
@@ -159,7 +159,7 @@ def test_nan_of_one_sample_and_joint_stays_there(which: int) -> None:
     assert torch.equal(torch.where(lost, clean, found), clean)
 
 
-def test_joints_do_not_see_one_another() -> None:
+def test_joints_are_independent() -> None:
     schedule = trained(joints=3)
     qd, qdd, _ = motion(10, 3)
     together = schedule(qd, qdd)
@@ -169,7 +169,7 @@ def test_joints_do_not_see_one_another() -> None:
     assert not torch.equal(together[:, 1], apart[:, 1])
 
 
-def test_any_batch_shape_is_samples() -> None:
+def test_any_batch_shape_is_accepted() -> None:
     schedule = trained()
     qd, qdd, _ = motion(3, 4, 2)
     flat = schedule(qd.reshape(-1, 2), qdd.reshape(-1, 2))
@@ -177,7 +177,7 @@ def test_any_batch_shape_is_samples() -> None:
     torch.testing.assert_close(schedule(qd[0, 0], qdd[0, 0]), flat[0], rtol=1e-13, atol=0)
 
 
-def test_the_parameter_vector_goes_round_bit_for_bit() -> None:
+def test_parameter_vector_round_trip_is_exact() -> None:
     schedule, other = trained(), NeuroFuzzy(LINEAR, 2)
     vector = schedule.parameter_vector()
     other.set_parameter_vector(vector)
@@ -189,10 +189,10 @@ def test_the_parameter_vector_goes_round_bit_for_bit() -> None:
         other.set_parameter_vector(before[1:])
 
 
-def test_the_prior_pulls_to_the_reference() -> None:
+def test_prior_is_centred_on_the_reference() -> None:
     schedule = trained(prior_sd=0.2, learn_sets=True, interpretable=True)
     mean, sd = schedule.prior()
-    # Weights, widths relative to their start, spacings as logits, and centres in widths.
+    # Weights, widths relative to their initial values, spacings as logits, and centres in widths.
     widths = schedule.network.head.log_widths.detach().exp().reshape(-1)
     units = {"set spacings": LOGIT_SD / 0.2, "head centres": widths}
     for k, name in enumerate(schedule.group_names()):
@@ -209,11 +209,11 @@ def test_the_prior_pulls_to_the_reference() -> None:
     ("law", "constant", "outputs", "fixed"),
     [(STRIBECK, ["delta"], 4, 0), (ELASTO_PLASTIC, ["sigma_0", "rho"], 6, 1)],
 )
-def test_a_coefficient_that_is_not_fitted_stays_constant(law, constant, outputs, fixed) -> None:
+def test_fixed_coefficient_stays_constant(law, constant, outputs, fixed) -> None:
     schedule = NeuroFuzzy(law, 2)
     lower, upper = schedule.bounds()
     bound = lower == upper
-    # The planes of all rules and the units, at both joints; no output for the last coefficients.
+    # The planes of all rules and the units, for both joints; no output for the last coefficients.
     assert len(lower) == outputs * 2 * (25 * 3 + 10)
     assert int(bound.sum()) == fixed * 2 * (25 * 3 + 10)
     assert torch.isinf(lower[~bound]).all()
@@ -228,7 +228,7 @@ def test_a_coefficient_that_is_not_fitted_stays_constant(law, constant, outputs,
 
 
 def by_parameters(schedule: NeuroFuzzy, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Jacobian (sample, joint, coefficient, parameter) by reverse differentiation of everything."""
+    """Jacobian (sample, joint, coefficient, parameter) by full reverse-mode differentiation."""
     values = schedule.trained()
     by_identity = {id(p): name for name, p in schedule.named_parameters()}
     names = [by_identity[id(p)] for p in values]
@@ -244,7 +244,7 @@ def by_parameters(schedule: NeuroFuzzy, qd: Tensor, qdd: Tensor) -> Tensor:
 
 @both_ways
 @pytest.mark.parametrize("sets", [None, {"interpretable": False}, {"interpretable": True}])
-def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, sets: dict | None):
+def test_parameter_sensitivities_equal_the_full_jacobian(acceleration: str, sets: dict | None):
     learnt = sets is not None
     schedule = trained(
         NONLINEAR, 2, terms=(3, 2), head_units=4, acceleration=acceleration, learn_sets=learnt,
@@ -261,7 +261,7 @@ def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, sets:
 
 
 @pytest.mark.parametrize("learnt", [False, True])
-def test_factored_sensitivities_are_contracted_as_if_multiplied_out(learnt: bool) -> None:
+def test_factored_sensitivities_equal_the_expanded_ones(learnt: bool) -> None:
     schedule = trained(NONLINEAR, 2, terms=(3, 2), head_units=4, learn_sets=learnt)
     qd, qdd, _ = motion(6, 2)
     found = schedule.sensitivities(qd, qdd)
@@ -281,10 +281,10 @@ def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Ten
 
 
 @both_ways
-def test_motion_sensitivities_are_those_of_differences(acceleration: str) -> None:
+def test_motion_sensitivities_equal_finite_differences(acceleration: str) -> None:
     schedule = trained(acceleration=acceleration)
     qd, qdd, _ = motion(40, 2)
-    # Away from where |qd| and the clamp to the trained range have corners.
+    # Away from the kinks of |qd| and of the clamp to the trained range.
     qd = qd.sign() * (0.5 + qd.abs()).clamp(max=19.0)
     qdd = qdd.clamp(-190, 190)
     found = schedule.sensitivities(qd, qdd)
@@ -304,7 +304,7 @@ def test_sensitivities_at_rest_are_finite() -> None:
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
-def test_the_heads_bias_would_say_what_the_rules_constants_say(outputs: int) -> None:
+def test_bias_of_the_head_is_redundant_with_the_rules_constants(outputs: int) -> None:
     law = (VISCOUS, LINEAR)[outputs - 1]
     biased, shifted = NeuroFuzzy(law, 2), NeuroFuzzy(law, 2)
     with torch.no_grad():
@@ -324,14 +324,14 @@ def test_options_are_refused_by_name() -> None:
         NeuroFuzzy(LINEAR, 2, terms=(5, 5, 5))
 
 
-def test_parameter_names_say_where_a_parameter_acts() -> None:
+def test_parameter_names_match_where_a_parameter_acts() -> None:
     schedule = trained(learn_sets=True)
     joints = [f"pivot {k + 1}" for k in range(schedule.joints)]
     names = schedule.parameter_names(joints)
     vector = schedule.parameter_vector()
     assert len(set(names)) == len(names) == len(vector)
     qd, qdd, _ = motion(30, schedule.joints)
-    # The head takes what the rules say, so with one other coefficients of the joint would follow.
+    # The head takes the rules' output, so with one other coefficients of the joint would change.
     vector[[k for k, name in enumerate(names) if "head" in name]] = 0.0
     schedule.set_parameter_vector(vector)
     before = schedule(qd, qdd).detach()
@@ -349,15 +349,15 @@ def test_parameter_names_say_where_a_parameter_acts() -> None:
         }
         assert found <= {where}
         acting += len(found)
-    # Rules that no sample of the motion fires do nothing.
+    # Rules that no sample of the motion fires have no effect.
     assert acting > 0.5 * len(tried)
 
 
 @every_law
 @both_ways
 @pytest.mark.parametrize("interpretable", [False, True])
-def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, interpretable: bool):
-    """In closed form, also where inputs are clamped and at rest."""
+def test_derivatives_equal_automatic_differentiation(law, acceleration: str, interpretable: bool):
+    """In closed form, also with clamped inputs and at rest."""
     schedule = trained(law, acceleration=acceleration, interpretable=interpretable)
     qd, qdd = (scale * normal(100, 2, seed=seed) for seed, scale in enumerate((20.0, 200.0)))
     qd[0] = qd[26, 0] = 0.0
@@ -368,13 +368,13 @@ def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, i
     for k in range(held.shape[-1]):
         expected = torch.autograd.grad(held[..., k].sum(), (qd, qdd), retain_graph=True)
         for ours, automatic in zip(found, expected, strict=True):
-            # Both are exact; digits are lost only where the positive map is all but flat.
+            # Both are exact; digits are lost only where the positive map is nearly flat.
             torch.testing.assert_close(
                 ours[..., k], automatic, rtol=1e-10, atol=1e-13 * float(automatic.abs().max())
             )
 
 
-def test_inputs_add_terms_that_leave_the_law_as_it_was() -> None:
+def test_added_inputs_do_not_change_the_law_initially() -> None:
     plain = NFCVFM(2, [0.1, 0.2])
     model = NFCVFM(2, [0.1, 0.2, 0.03, 0.04], inputs=["direction", "load"])
     qd, qdd = torch.tensor([[-2.0, 3.0]]).double(), torch.zeros(1, 2).double()
@@ -393,6 +393,6 @@ def test_inputs_are_refused_by_name(inputs: list[str]) -> None:
         NFCVFM(2, inputs=inputs)
 
 
-def test_a_choice_of_no_inputs_outlasts_a_file(tmp_path) -> None:
+def test_choice_of_no_inputs_is_kept_in_a_file(tmp_path) -> None:
     assert load(save(NFCVFM(1, inputs=()), tmp_path / "m.json")).inputs == []
     assert load(save(NFCVFM(1), tmp_path / "m.json")).inputs is None

@@ -1,4 +1,4 @@
-"""Positive numbers, and the way out of a range: monotone, and smooth where told so."""
+"""Positive maps, and fading outside a range: monotone, and smooth as specified."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from tests.friction.samples import normal
 
 
 @given(st.floats(-1e100, 1e100), st.floats(1e-6, 1.0))
-def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, roundness: float):
+def test_positive_map_hardly_changes_positive_values(u: float, roundness: float):
     y = smooth_relu(torch.tensor(u, dtype=torch.float64), roundness)
     assert y >= 0
     assert y >= u
@@ -18,14 +18,15 @@ def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, round
 
 
 @given(st.floats(1e-2, 1e6))
-def test_the_positive_map_is_undone(y: float) -> None:
+def test_positive_map_is_invertible(y: float) -> None:
     u = smooth_relu_inverse(torch.tensor(y, dtype=torch.float64), 0.05)
-    # For y below the roundness, u is negative and up to 25 times as large: two digits are lost.
+    # For y below the rounding width, u is negative and up to 25 times as large: two digits are
+    # lost.
     assert float(smooth_relu(u, 0.05)) == pytest.approx(y, rel=1e-13)
 
 
 @pytest.mark.parametrize("reach", [0.5, 2.0])
-def test_taper_goes_from_one_to_nothing_without_a_corner(reach: float) -> None:
+def test_taper_is_smooth_from_one_to_zero(reach: float) -> None:
     direction = torch.tensor([0.6, -0.8], dtype=torch.float64)
     distance = torch.linspace(0.0, 2 * reach, 4001, dtype=torch.float64)[:, None]
     weight = taper(distance * direction, reach)
@@ -33,14 +34,13 @@ def test_taper_goes_from_one_to_nothing_without_a_corner(reach: float) -> None:
     assert float(weight[1000]) == pytest.approx((1 - 0.25) ** 2)
     assert (weight[2000:] == 0).all()
     assert (weight[:2001].diff() <= 0).all()
-    # The largest second derivative is 8 / reach^2, of the slope's sudden change at 1 - |e| / reach
-    # there is none.
+    # The largest second derivative is 8 / reach^2; the slope of 1 - |e| / reach would jump.
     step = 2 * reach / 4000
     assert (weight.diff().diff().abs() <= 8.01 * (step / reach) ** 2).all()
     assert weight[1] > 1 - 2.1 * (step / reach) ** 2
 
 
-def test_slope_of_fading_is_that_of_automatic_differentiation() -> None:
+def test_derivative_of_the_taper_equals_automatic_differentiation() -> None:
     beyond = (0.4 * normal(200, 3)).requires_grad_()
     (expected,) = torch.autograd.grad(taper(beyond, 0.7).sum(), beyond)
     found = taper_slope(beyond, 0.7).detach()

@@ -1,4 +1,4 @@
-"""The ANFIS layer: a partition of unity, linear in its consequents, the same in every executor."""
+"""The ANFIS layer: a partition of unity, linear in its consequents, equal in every executor."""
 
 from collections.abc import Callable
 
@@ -35,7 +35,7 @@ def samples(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def naive(layer: Anfis, x: np.ndarray) -> np.ndarray:
-    """Takagi-Sugeno inference of one sample by the textbook: products, sums, loops."""
+    """Takagi-Sugeno inference of one sample as in textbooks: products, sums, loops."""
     centres, widths = (v.detach().numpy() for v in layer.sets())
     consequents = layer.consequents.detach().numpy()
     y = np.zeros((layer.groups, layer.outputs))
@@ -52,8 +52,8 @@ def naive(layer: Anfis, x: np.ndarray) -> np.ndarray:
         firing = [np.prod(one) for one in np.ndindex(*layer.terms) for one in [_pick(held, one)]]
         for o in range(layer.outputs):
             slopes, constant = consequents[g, o, :, :-1], consequents[g, o, :, -1]
-            said = constant + (slopes @ x[g] if layer.order == 1 else 0)
-            y[g, o] = np.dot(firing, said) / np.sum(firing)
+            consequent = constant + (slopes @ x[g] if layer.order == 1 else 0)
+            y[g, o] = np.dot(firing, consequent) / np.sum(firing)
     return y
 
 
@@ -62,7 +62,7 @@ def _pick(held: list[np.ndarray], indices: tuple[int, ...]) -> list[float]:
 
 
 @pytest.mark.parametrize("options", VARIANTS)
-def test_it_is_the_textbook_inference(options: dict) -> None:
+def test_output_equals_textbook_inference(options: dict) -> None:
     layer = random_layer(terms=(4, 3, 2), **options)
     x = samples(5, 3, 3)
     expected = np.stack([naive(layer, one) for one in x.numpy()])
@@ -103,11 +103,11 @@ def test_affine_functions_are_reproduced_everywhere() -> None:
     for name in ("slopes", "far"):
         z = x if name == "slopes" else 5 * x
         expected = torch.stack([z[..., 0] - 2 * z[..., 1] + 3, -z[..., 0]], -1)
-        # Far from the samples the rules extrapolate what they learnt, up to the conditioning.
+        # Far from the samples the rules extrapolate what they learnt, limited by the conditioning.
         torch.testing.assert_close(layer(z), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_inputs_may_lie_anywhere() -> None:
+def test_inputs_far_from_the_grid_are_handled() -> None:
     layer, moved = random_layer(order=0), random_layer(order=0)
     shift, scale = 1e4, 1e-2
     centres, widths = layer.sets()
@@ -128,7 +128,7 @@ def test_groups_are_independent_and_batches_of_any_shape() -> None:
     torch.testing.assert_close(layer(x[2, 3]), layer(x)[2, 3], rtol=1e-13, atol=1e-14)
 
 
-def test_relabelling_the_terms_changes_nothing() -> None:
+def test_output_is_invariant_to_relabelling_the_terms() -> None:
     layer, other = random_layer(), random_layer()
     order = torch.tensor([2, 0, 3, 1])
     with torch.no_grad():
@@ -163,7 +163,7 @@ def test_least_squares_is_stationary(prior_precision: float) -> None:
     assert gradient.abs().max() < 1e-9 * y.square().sum()
 
 
-def test_without_samples_near_a_rule_it_is_zero() -> None:
+def test_rules_without_nearby_samples_are_zero() -> None:
     layer = Anfis(1, 1, [5], 1)
     layer.init_grid(0.0, 1000.0)
     x = samples(50, 1, 1) * 20
@@ -172,7 +172,7 @@ def test_without_samples_near_a_rule_it_is_zero() -> None:
     torch.testing.assert_close(far, torch.zeros_like(far))
 
 
-@pytest.mark.parametrize("options", VARIANTS[4:])  # zero order is the same code less a product
+@pytest.mark.parametrize("options", VARIANTS[4:])  # zero order is the same code without a product
 def test_gradients_forward_and_reverse(options: dict) -> None:
     layer = random_layer(groups=1, terms=(3, 2), **options)
     names = [name for name, _ in layer.named_parameters()]
@@ -199,7 +199,7 @@ def test_per_sample_jacobians_by_vmap() -> None:
 
 
 @pytest.mark.parametrize("options", [VARIANTS[0], *VARIANTS[4:]])
-def test_script_and_export_are_the_same(options: dict) -> None:
+def test_scripted_and_exported_layers_agree(options: dict) -> None:
     layer, x = random_layer(**options), samples(9, 3, 2)
     scripted = torch.jit.script(layer)
     torch.testing.assert_close(scripted(x), layer(x), rtol=1e-14, atol=1e-15)
@@ -209,7 +209,7 @@ def test_script_and_export_are_the_same(options: dict) -> None:
     torch.testing.assert_close(program.module()(z), layer(z), rtol=1e-14, atol=1e-15)
 
 
-def test_float32_follows() -> None:
+def test_float32_agrees_with_float64() -> None:
     layer = Anfis(2, 2, [3, 3], 1).float()
     x = samples(10, 2, 2).float()
     layer.solve_consequents(x, x[..., :1] ** 2)
@@ -251,7 +251,7 @@ def test_unsound_options_and_samples_are_refused() -> None:
 
 @pytest.mark.parametrize("options", VARIANTS)
 @pytest.mark.parametrize("terms", [(5,), (4, 3), (2, 3, 2)])
-def test_the_input_jacobian_is_each_output_s_own(options: dict, terms: tuple[int, ...]) -> None:
+def test_input_jacobian_has_one_block_per_output(options: dict, terms: tuple[int, ...]) -> None:
     layer = random_layer(terms=terms, **options)
     x = samples(20, 3, len(terms)).requires_grad_()
     y = layer(x)

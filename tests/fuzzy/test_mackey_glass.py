@@ -1,4 +1,4 @@
-"""The chaotic series of the benchmark: its integration and its pairs."""
+"""The chaotic benchmark series: its integration and its input-output pairs."""
 
 import importlib.util
 from pathlib import Path
@@ -23,7 +23,7 @@ def series() -> ModuleType:
     return module
 
 
-def test_it_decays_until_the_delayed_value_arrives(series: ModuleType) -> None:
+def test_series_decays_until_the_delayed_value_arrives(series: ModuleType) -> None:
     # For t <= tau the delayed value is 0, so that x(t) = 1.2 exp(-0.1 t).
     t = torch.arange(18, dtype=FLOAT64)
     wanted = 1.2 * torch.exp(-0.1 * t)
@@ -33,13 +33,13 @@ def test_it_decays_until_the_delayed_value_arrives(series: ModuleType) -> None:
 def test_the_integration_is_of_fourth_order(series: ModuleType) -> None:
     coarse, fine, finest = (series.mackey_glass(60, step=h) for h in (0.1, 0.05, 0.025))
     ratio = float((coarse - fine).norm() / (fine - finest).norm())
-    assert 12 < ratio < 20  # 2^4, and terms of higher order
-    # Chaos grows what is left by some thousand times over the whole series.
+    assert 12 < ratio < 20  # 2^4 and higher-order terms
+    # Chaos amplifies the remaining error some thousand times over the whole series.
     whole = series.mackey_glass(1123) - series.mackey_glass(1123, step=0.05)
     assert whole.abs().max() < 1e-5
 
 
-def test_pairs_are_four_past_values_and_one_to_come(series: ModuleType) -> None:
+def test_pairs_are_four_past_values_and_one_future_value(series: ModuleType) -> None:
     x, y = series.pairs(torch.arange(1124, dtype=FLOAT64))
     assert x.shape == (1000, 4)
     assert x[0].tolist() == [100, 106, 112, 118]

@@ -1,4 +1,4 @@
-"""Memberships: where they are one half, that they stay in [0, 1], and ranges."""
+"""Memberships: half-width points, values within [0, 1], sets from ranges."""
 
 import math
 
@@ -47,7 +47,7 @@ def test_half_width_of_a_gaussian_and_of_a_bell(centre: float, width: float) -> 
     )
 
 
-def test_logarithms_agree_and_outlive_underflow() -> None:
+def test_log_memberships_agree_and_do_not_underflow() -> None:
     x = torch.linspace(-4, 4, 101, dtype=FLOAT64)
     c, s, b = t(0.3), t(0.7), t(1.7)
     plain_bell = 1 / (1 + ((x - c) / s).abs() ** (2 * b))
@@ -90,13 +90,13 @@ def test_shoulders_saturate_outward_and_meet_the_two_sided_gaussian() -> None:
     assert torch.equal(two_sided_gaussian(x, t(0.2), infinite, t(0.2), t(0.5)), left)
 
 
-def test_trapezoid_with_a_cliff() -> None:
+def test_trapezoid_may_have_a_vertical_edge() -> None:
     x = torch.tensor([-0.1, 0.0, 0.5, 1.0, 1.5, 2.0, 2.1], dtype=FLOAT64)
     held = trapezoid(x, t(0.0), t(0.0), t(1.0), t(2.0))
     assert held.tolist() == [0, 1, 1, 1, 0.5, 0, 0]
 
 
-def test_sets_from_ranges_fall_alike_at_the_ends_of_their_range() -> None:
+def test_sets_from_ranges_have_equal_membership_at_both_ends() -> None:
     sets = sets_from_ranges(["a", "b", "c"], [(0.0, 4.0), (3.0, 9.0), (8.0, 10.0)])
     at = math.exp(-2)  # two sigma
     inner = [(sets[0], 4.0), (sets[1], 3.0), (sets[1], 9.0), (sets[2], 8.0)]

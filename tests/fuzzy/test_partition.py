@@ -1,4 +1,4 @@
-"""Ordered partitions keep their promises whatever the parameters are."""
+"""Ordered partitions stay ordered and overlapping for any parameters."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ FLOAT64 = torch.float64
     st.floats(0.1, 10),
     st.sampled_from(["gaussian", "bell"]),
 )
-def test_ordered_in_range_and_overlapping(
+def test_sets_are_ordered_in_range_and_overlapping(
     seed: int, terms: list[int], spread: float, kind: str
 ) -> None:
     layer = Anfis(2, len(terms), terms, 1, kind=kind, interpretable=True)
@@ -36,7 +36,7 @@ def test_ordered_in_range_and_overlapping(
         assert (c >= lower - slack).all()
         assert (c <= upper + slack).all()
         assert (c.diff(dim=1) > 0).all()
-        # Neighbours' intervals of membership one half or more touch, and reach the ends.
+        # Neighbours' intervals of membership at least one half touch, and reach the ends.
         assert (h[:, :-1] + h[:, 1:] >= c.diff(dim=1) - slack).all()
         assert (c[:, 0] - h[:, 0] <= lower + slack).all()
         assert (c[:, -1] + h[:, -1] >= upper - slack).all()
@@ -47,7 +47,7 @@ def test_ordered_in_range_and_overlapping(
         assert held.amax(-1).min() >= 0.5 - 1e-9
 
 
-def test_assignment_keeps_a_partition_that_is_within_bounds() -> None:
+def test_assigned_partition_within_bounds_is_kept() -> None:
     layer = Anfis(1, 1, [3], 1, interpretable=True)
     centres = torch.tensor([0.1, 0.45, 0.9], dtype=FLOAT64)
     widths = torch.tensor([0.2, 0.25, 0.3], dtype=FLOAT64)

@@ -1,4 +1,4 @@
-"""Radial basis functions: their formula, placing of centres, and a head that starts as nothing."""
+"""Radial basis functions: their formula, placing of centres, and a head initialised at zero."""
 
 import math
 from copy import deepcopy
@@ -37,7 +37,7 @@ def naive(network: RBFNetwork, x: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4])
-def test_the_expanded_exponent_is_the_plain_one_wherever_the_inputs_lie(offset: float) -> None:
+def test_expanded_exponent_equals_the_plain_one_for_any_inputs(offset: float) -> None:
     network, x = shaken(RBFNetwork(3)), samples(6, 5, 3, 2)
     with torch.no_grad():
         network.centres += offset
@@ -47,7 +47,7 @@ def test_the_expanded_exponent_is_the_plain_one_wherever_the_inputs_lie(offset: 
     )
 
 
-def test_expansion_loses_no_more_than_narrow_units_must() -> None:
+def test_rounding_error_of_the_expansion_is_within_its_bound() -> None:
     network, x = shaken(RBFNetwork(2)), samples(500, 2, 2)
     with torch.no_grad():
         network.log_widths.fill_(-7.0)  # a thousandth of the range
@@ -57,7 +57,7 @@ def test_expansion_loses_no_more_than_narrow_units_must() -> None:
 
 
 @pytest.mark.parametrize("kind", ["network", "combined"])
-def test_script_export_and_vmap_are_the_same(kind: str) -> None:
+def test_script_export_and_vmap_agree(kind: str) -> None:
     module = shaken(RBFNetwork(3) if kind == "network" else AnfisRBF(3, 2, [4, 3], 2, units=6))
     x, z = samples(9, 3, 2), samples(5, 3, 2, seed=3)
     scripted = torch.jit.script(module)
@@ -93,7 +93,7 @@ def test_output_layer_is_stationary(prior_precision: float) -> None:
         assert gradient.abs().max() < 1e-9 * y.square().sum()
 
 
-def test_the_input_jacobian_is_each_output_s_own() -> None:
+def test_input_jacobian_has_one_block_per_output() -> None:
     network = shaken(RBFNetwork(3))
     x = samples(20, 3, 2).requires_grad_()
     y = network(x)
@@ -117,8 +117,8 @@ def test_kmeans_is_repeatable_and_finds_clusters() -> None:
     assert torch.equal(network.centres[0].detach(), found)
 
 
-def test_orthogonal_least_squares_finds_the_units_that_made_the_data() -> None:
-    # Interior samples as centres: each of the true units is a candidate.
+def test_orthogonal_least_squares_finds_the_true_units() -> None:
+    # Interior samples as centres: each true unit is a candidate.
     x = samples(400, 1, 2)
     truth = RBFNetwork(1, units=3)
     width = 0.5 * x[:, 0].std(0)
@@ -157,7 +157,7 @@ def test_more_units_fit_better(place: str) -> None:
     assert errors[2] < 0.3 * errors[1] < 0.3 * errors[0]
 
 
-def test_a_head_changes_nothing_at_the_start_and_improves_when_solved() -> None:
+def test_head_is_zero_at_the_start_and_improves_when_solved() -> None:
     x = samples(500, 2, 2)
     y = surface(x)
     assert (AnfisRBF(2, 1, (3,), 3).head(samples(5, 2, 4)) == 0).all()
@@ -169,11 +169,11 @@ def test_a_head_changes_nothing_at_the_start_and_improves_when_solved() -> None:
     model.init_head(x)
     assert torch.equal(model(x), before)
     model.solve_head(x, y)
-    # Least squares of a layer that may stay zero cannot fit worse.
+    # Least squares of a layer that may stay zero cannot increase the error.
     assert (model(x) - y).square().sum() < (before - y).square().sum()
 
 
-def test_a_fresh_head_stands_in_the_range_of_the_grid() -> None:
+def test_initial_centres_lie_in_the_range_of_the_grid() -> None:
     model = AnfisRBF(2, 2, [3, 3], 1, units=40)
     model.init_grid(torch.tensor([0.0, 10.0]), torch.tensor([1.0, 30.0]))
     low = torch.tensor([0.0, 10.0, -1.0], dtype=FLOAT64)
@@ -206,7 +206,7 @@ def test_unsound_sizes_and_samples_are_refused() -> None:
 
 
 @pytest.mark.parametrize("width", [1e-1, 1e-3, 1e-5])
-def test_narrow_units_are_right_in_single_precision(width: float) -> None:
+def test_narrow_units_are_accurate_in_single_precision(width: float) -> None:
     """Units one apart; the expanded square would lose the digits of their distances."""
     network = RBFNetwork(1, inputs=1, units=2, outputs=1).requires_grad_(False)
     network.centres.copy_(torch.tensor([[[0.0], [1.0]]]))

@@ -1,4 +1,4 @@
-"""Readers that work in a process of their own, for tests of what they read in this one."""
+"""Readers that run in this process, for tests of what they read."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from nfriction.io.formats import measurements
 
 @pytest.fixture
 def without_worker(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """A function that has files read here, which takes no second for imports."""
+    """Make file readers run in this process, which saves the imports of a worker."""
 
     def read(library: str, path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
         with tempfile.TemporaryDirectory() as folder:

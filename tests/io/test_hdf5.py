@@ -1,4 +1,4 @@
-"""HDF5 and MATLAB 7.3 files, where h5py is installed, and what is said where it is not."""
+"""HDF5 and MATLAB 7.3 files with h5py, and the error without it."""
 
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ def h5py() -> Any:
     return pytest.importorskip("h5py", reason="the extra nfriction[hdf5] is not installed")
 
 
-def test_without_h5py_it_is_said_how_to_get_it(
+def test_without_h5py_the_error_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
@@ -29,10 +29,10 @@ def test_without_h5py_it_is_said_how_to_get_it(
 
 
 @pytest.mark.parametrize("spec", ["log/enc[0]:deg", "/log/enc[0]:deg", "log.enc[0]:deg"])
-def test_data_sets_are_named_by_their_path(h5py: Any, tmp_path: Path, spec: str) -> None:
+def test_datasets_are_named_by_their_path(h5py: Any, tmp_path: Path, spec: str) -> None:
     with h5py.File(tmp_path / "run.h5", "w") as file:
         file["time"] = TIME
-        file["number"] = np.dtype("f8")  # a type is no signal
+        file["number"] = np.dtype("f8")  # a type is not a signal
         file.create_dataset("log/enc", data=np.rad2deg(Q), compression="gzip")
     back = Recording.read(tmp_path / "run.h5", columns={"q1": spec})
     np.testing.assert_allclose(back.q[:, 0], Q[:, 0], rtol=6e-16)
@@ -63,7 +63,7 @@ def test_matlab_7_3_records_are_read_by_name_and_path(h5py: Any, tmp_path: Path)
         assert np.array_equal(back.time, TIME)
 
 
-def test_matrices_of_matlab_7_3_lie_turned_and_empty_ones_are_none(
+def test_matrices_of_matlab_7_3_are_transposed_and_empty_ones_skipped(
     h5py: Any, tmp_path: Path
 ) -> None:
     square = np.arange(64.0).reshape(8, 8)
@@ -80,7 +80,7 @@ def test_matrices_of_matlab_7_3_lie_turned_and_empty_ones_are_none(
     assert back.tau is None
 
 
-def test_nothing_outside_the_file_is_read(h5py: Any, tmp_path: Path) -> None:
+def test_links_outside_the_file_are_not_followed(h5py: Any, tmp_path: Path) -> None:
     (tmp_path / "secret.bin").write_bytes(TIME.tobytes())
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = TIME

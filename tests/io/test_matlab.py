@@ -1,4 +1,4 @@
-"""MATLAB files of version 5: variables, structs, cells, ControlDesk's records, damage."""
+"""MATLAB 5 files: variables, structs, cells, ControlDesk records, damage."""
 
 import struct
 import zlib
@@ -26,11 +26,11 @@ def _in_this_process(request: pytest.FixtureRequest, without_worker: Callable[[]
         without_worker()
 
 
-# The process is part of what these tests are of.
+# These tests include the worker process.
 IN_A_WORKER = {
-    "test_plain_variables_either_way_round",
-    "test_what_cannot_be_a_recording_is_named",
-    "test_shapes_that_are_none_are_refused",
+    "test_plain_variables_as_rows_or_columns_are_read",
+    "test_values_that_cannot_be_a_recording_are_named",
+    "test_invalid_shapes_are_refused",
     "test_damaged_files_are_read_or_refused",
 }
 
@@ -50,7 +50,7 @@ def structs(*elements: dict[str, Any]) -> np.ndarray:
 
 
 def controldesk(**axes: Any) -> dict[str, Any]:
-    """As ControlDesk writes: one variable, X and Y arrays of structs, names in quotes."""
+    """ControlDesk format: one variable, X and Y arrays of structs, names in quotes."""
     y = [
         {"Name": f'"Model Root/enc {k + 1}/Out1"', "Type": "double", "Data": Q[None, :, k],
          "Unit": "", "XIndex": 1}
@@ -61,7 +61,7 @@ def controldesk(**axes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("rows", [True, False])
-def test_plain_variables_either_way_round(tmp_path: Path, rows: bool) -> None:
+def test_plain_variables_as_rows_or_columns_are_read(tmp_path: Path, rows: bool) -> None:
     turn = (lambda x: x) if rows else np.transpose
     back = read(tmp_path, {"time": TIME, "q": turn(Q), "tau": turn(2 * Q), "remark": "fine"})
     assert np.array_equal(back.q, Q)
@@ -80,11 +80,11 @@ def test_plain_variables_either_way_round(tmp_path: Path, rows: bool) -> None:
          {"time": "log[0].v", "q1": "log[1].v", "q2": "log[2].v"}),
     ],
 )  # fmt: skip
-def test_paths_lead_into_structs(
+def test_paths_select_fields_of_structs(
     tmp_path: Path, content: dict[str, Any], columns: dict[str, str]
 ) -> None:
     back = read(tmp_path, content, columns=columns)
-    # Degrees and back: three roundings.
+    # Conversion to degrees and back: three roundings.
     np.testing.assert_allclose(back.q, Q, rtol=6e-16)
     np.testing.assert_allclose(back.time, TIME, rtol=4e-16)
 
@@ -99,13 +99,13 @@ def test_controldesk_records_are_read_by_name(tmp_path: Path, prefix: str) -> No
     assert np.array_equal(read(tmp_path, controldesk(), columns=inside).q[:, 0], Q[:, 1])
 
 
-def test_a_name_that_two_signals_bear_leads_nowhere(tmp_path: Path) -> None:
+def test_name_of_two_signals_is_ambiguous(tmp_path: Path) -> None:
     content = controldesk() | {"run_002": controldesk()["run_001"]}
     with pytest.raises(ValueError, match="Model Root/enc 1/Out1 are missing; found run_001"):
         read(tmp_path, content, columns={"q1": "Model Root/enc 1/Out1"})
 
 
-def test_what_cannot_be_a_recording_is_named(tmp_path: Path) -> None:
+def test_values_that_cannot_be_a_recording_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="columns time, q1 are missing; found a, b"):
         read(tmp_path, {"a": TIME, "b": TIME})
     with pytest.raises(ValueError, match="different numbers of samples: q1 20, time 40"):
@@ -115,7 +115,7 @@ def test_what_cannot_be_a_recording_is_named(tmp_path: Path) -> None:
         Recording.read(tmp_path / "old.mat")
 
 
-def test_every_kind_of_number_is_read(tmp_path: Path) -> None:
+def test_every_numeric_type_is_read(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     kinds = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
     numbers = {kind: (50 * rng.random(40)).astype(kind) for kind in kinds}
@@ -151,13 +151,11 @@ def test_the_other_byte_order_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("skipped", [scipy.sparse.eye(3).tocsc(), np.ones(3) * 1j])
-def test_what_is_no_signal_is_passed_over(tmp_path: Path, skipped: Any) -> None:
+def test_variables_that_are_no_signals_are_skipped(tmp_path: Path, skipped: Any) -> None:
     assert np.array_equal(read(tmp_path, {"s": skipped, "time": TIME, "q": Q}).q, Q)
 
 
-def test_what_unpacks_to_far_more_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decompression_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     savemat(tmp_path / "run.mat", {"time": np.zeros(10**6)}, do_compression=True)
     assert (tmp_path / "run.mat").stat().st_size < 20_000
     monkeypatch.setattr("nfriction.io.formats.LARGEST", 10**6)
@@ -178,13 +176,13 @@ def element(kind: int, content: bytes) -> bytes:
     ],
 )
 @pytest.mark.parametrize("kind", [1, 6])
-def test_shapes_that_are_none_are_refused(tmp_path: Path, shape: bytes, kind: int) -> None:
+def test_invalid_shapes_are_refused(tmp_path: Path, shape: bytes, kind: int) -> None:
     flags = element(6, struct.pack("<II", kind, 0))
     array = flags + shape + element(1, b"q1") + element(9, struct.pack("<dd", 1.0, 2.0))
     refused(tmp_path, element(14, array))
 
 
-def test_a_packed_variable_of_a_few_bytes_is_refused(tmp_path: Path) -> None:
+def test_truncated_compressed_variable_is_refused(tmp_path: Path) -> None:
     packed = zlib.compress(b"abc")
     refused(tmp_path, struct.pack("<II", 15, len(packed)) + packed)
 

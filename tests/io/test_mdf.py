@@ -1,4 +1,4 @@
-"""MDF files, where asammdf is installed, and what is said where it is not."""
+"""MDF files with asammdf, and the error without it."""
 
 import sys
 from collections.abc import Callable
@@ -16,7 +16,7 @@ TIME = np.arange(40) / 1000
 Q = np.random.default_rng(0).normal(size=(40, 2)) / 7
 
 
-def test_without_asammdf_it_is_said_how_to_get_it(
+def test_without_asammdf_the_error_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "asammdf", None)
@@ -69,7 +69,7 @@ def test_channels_of_different_rasters_are_refused(
 
 
 def test_channels_of_arrays_are_refused() -> None:
-    """Damaged files have such, where none can be written."""
+    """Damaged files contain them, although none can be written."""
     arrays = SimpleNamespace(samples=Q, timestamps=TIME, unit="rad")
     file = SimpleNamespace(channels_db={"q1": ((0, 1),)}, get=lambda _: arrays)
     with pytest.raises(ValueError, match="channel q1 has arrays"):
@@ -79,7 +79,7 @@ def test_channels_of_arrays_are_refused() -> None:
 @pytest.mark.parametrize(
     "part", [0.5, *(pytest.param(part, marks=pytest.mark.slow) for part in (0.25, 64, 10))]
 )
-def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path, part: float) -> None:
+def test_truncated_file_is_refused(asammdf: Any, tmp_path: Path, part: float) -> None:
     path = tmp_path / "run.mf4"
     write(asammdf, path, [("q1", Q[:, 0], "rad")])
     content = path.read_bytes()
@@ -88,7 +88,7 @@ def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path, part: float) 
         Recording.read(path)
 
 
-def test_a_reader_that_perishes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_of_the_reader_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements, "find_spec", lambda _: True)
     monkeypatch.setattr(measurements, "__name__", "there.is_none")
     (tmp_path / "run.mf4").write_bytes(b"MDF     ")
@@ -96,7 +96,7 @@ def test_a_reader_that_perishes_is_told(tmp_path: Path, monkeypatch: pytest.Monk
         Recording.read(tmp_path / "run.mf4")
 
 
-def test_what_lies_where_the_user_stands_is_not_run(
+def test_modules_in_the_working_directory_are_not_run(
     asammdf: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(asammdf, tmp_path / "run.mf4", [("q1", Q[:, 0], "rad")])

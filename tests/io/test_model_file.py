@@ -1,4 +1,4 @@
-"""Model files: what is loaded is what was saved, and whatever is damaged is refused."""
+"""Model files: loading restores what was saved, and damaged files are refused."""
 
 import hashlib
 import json
@@ -48,7 +48,7 @@ def small(path: Path) -> tuple[LFM, Path]:
 
 
 def resigned(content: dict[str, Any]) -> bytes:
-    """A file with a checksum that fits, as one who forges it would write."""
+    """A file with a valid checksum, as a forger would write it."""
     content = {k: v for k, v in content.items() if k != "checksum"}
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return json.dumps(
@@ -57,7 +57,7 @@ def resigned(content: dict[str, Any]) -> bytes:
 
 
 @pytest.mark.parametrize("name", named_models())
-def test_a_model_comes_back_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_model_round_trip_is_exact(name: str, tmp_path: Path) -> None:
     model = named_models()[name]
     loaded = load(save(model, tmp_path / "model.json"))
     assert type(loaded) is type(model)
@@ -70,13 +70,13 @@ def test_a_model_comes_back_bit_for_bit(name: str, tmp_path: Path) -> None:
     assert torch.equal(loaded(*inputs), model(*inputs))
 
 
-def test_what_is_no_model_is_named_with_the_place_of_one(tmp_path: Path) -> None:
+def test_other_files_are_named_with_the_place_of_the_model(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"got LinearAxis; that of a fit is `result.model`"):
         save(LinearAxis(2.0), tmp_path / "m.json")  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
 
-def test_every_constructor_argument_of_the_named_models_is_kept(tmp_path: Path) -> None:
+def test_every_constructor_argument_of_named_models_is_stored(tmp_path: Path) -> None:
     for options in (
         {"terms": [2, 7]},
         {"head_units": 3},
@@ -93,7 +93,7 @@ def test_every_constructor_argument_of_the_named_models_is_kept(tmp_path: Path) 
         assert torch.equal(loaded.schedule.prior()[1], model.schedule.prior()[1]), options
 
 
-def test_extreme_values_come_back_bit_for_bit(tmp_path: Path) -> None:
+def test_extreme_values_are_restored_exactly(tmp_path: Path) -> None:
     model = NLFM(1)
     extremes = [-0.0, 5e-324, -1.7976931348623157e308, 1 / 3, 2**-0.5]
     with torch.no_grad():
@@ -102,7 +102,7 @@ def test_extreme_values_come_back_bit_for_bit(tmp_path: Path) -> None:
     assert raw.tobytes() == model.schedule.raw.detach().numpy().tobytes()
 
 
-def test_what_is_said_of_a_model_comes_back(tmp_path: Path) -> None:
+def test_model_info_round_trip_is_exact(tmp_path: Path) -> None:
     model, path = small(tmp_path)
     assert load_info(path) == INFO
     content = read_model_file(path)
@@ -114,7 +114,7 @@ def test_what_is_said_of_a_model_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_model_is_scored_from_its_file_alone(tmp_path: Path) -> None:
-    """The fitted mechanism comes back to the last bit, and with it every simulated sample."""
+    """The fitted mechanism is restored bit for bit, hence every simulated sample, too."""
     given = pendulum(convention=("absolute", "hanging"), position_quantum=1e-4)
     plant = given.replace(gravity_moment=1.03 * given.gravity_moment)
     model = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
@@ -126,7 +126,7 @@ def test_a_model_is_scored_from_its_file_alone(tmp_path: Path) -> None:
     assert (there.simulated == here.simulated).all()
 
 
-def test_a_loaded_model_is_compiled_by_default_and_trained_on_demand(tmp_path: Path) -> None:
+def test_loaded_model_is_compiled_by_default_and_trainable_on_demand(tmp_path: Path) -> None:
     path = save(LFM(2, [1e-3, 1e-3], v_smooth=0.05), tmp_path / "model.json")
     model, plant = load(path), pendulum()
     q0 = torch.tensor([0.1, 0.2], dtype=torch.float64)
@@ -152,7 +152,7 @@ def test_a_loaded_model_is_compiled_by_default_and_trained_on_demand(tmp_path: P
         ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "convention": 7}, "no mechanism"),
     ],
 )
-def test_a_file_without_a_sound_mechanism_gives_none(
+def test_file_without_a_valid_plant_has_none(
     rig: dict | None, message: str, tmp_path: Path
 ) -> None:
     path = save(LFM(2), tmp_path / "model.json", ModelInfo(rig=rig))
@@ -165,21 +165,21 @@ def test_a_file_without_a_sound_mechanism_gives_none(
 
 
 def test_units_of_a_sliding_axis_are_those_of_forces() -> None:
-    said = describe(NFLFM(1), ModelInfo(unit="m"))
-    assert [c["unit"] for c in said["coefficients"]] == ["N s/m", "N"]
-    assert said["units"] == {"qd": "m/s", "qdd": "m/s^2", "load": "-", "tau_f": "N"}
+    description = describe(NFLFM(1), ModelInfo(unit="m"))
+    assert [c["unit"] for c in description["coefficients"]] == ["N s/m", "N"]
+    assert description["units"] == {"qd": "m/s", "qdd": "m/s^2", "load": "-", "tau_f": "N"}
 
 
-def test_the_hash_is_of_the_parameters_and_nothing_else() -> None:
+def test_hash_depends_only_on_the_parameters() -> None:
     one, other = NFLFM(2), NFLFM(2)
     assert parameter_hash(one.state_dict()) == parameter_hash(other.state_dict())
     with torch.no_grad():
-        # The smallest change there is.
+        # The smallest possible change.
         one.schedule.scale.copy_(torch.nextafter(one.schedule.scale, torch.full((), 9.9).double()))
     assert parameter_hash(one.state_dict()) != parameter_hash(other.state_dict())
 
 
-def test_a_model_of_ones_own_fills_a_model_of_the_same_kind(tmp_path: Path) -> None:
+def test_user_defined_model_is_loaded_into_one_of_the_same_kind(tmp_path: Path) -> None:
     model = FrictionModel(QUADRATIC, NeuroFuzzy(QUADRATIC, 2, terms=(3, 3)))
     randomise(model, 0.3)
     path = save(model, tmp_path / "own.json")
@@ -205,7 +205,7 @@ RENAMED = Law("quadratic", (Coefficient("D_1", "N m"), Coefficient("D_3", "N m")
         (lambda: FrictionModel(QUADRATIC, Constant(QUADRATIC, 2)), "options"),
     ],
 )
-def test_a_model_of_another_kind_is_not_filled(
+def test_model_of_another_kind_is_not_loaded(
     other: Callable[[], FrictionModel], key: str, tmp_path: Path
 ) -> None:
     model = FrictionModel(QUADRATIC, NeuroFuzzy(QUADRATIC, 2, terms=(3, 3)))
@@ -218,7 +218,7 @@ def test_a_model_of_another_kind_is_not_filled(
     assert all(torch.equal(value, before[name]) for name, value in into.state_dict().items())
 
 
-def test_the_file_is_json_and_nothing_of_pickle(tmp_path: Path) -> None:
+def test_file_is_json_without_pickle(tmp_path: Path) -> None:
     _, path = small(tmp_path)
     json.loads(path.read_bytes())
     assert not path.read_bytes().startswith((b"PK", b"\x80"))
@@ -227,7 +227,7 @@ def test_the_file_is_json_and_nothing_of_pickle(tmp_path: Path) -> None:
 # Damage
 
 
-def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path) -> None:
+def test_file_truncated_anywhere_is_refused(tmp_path: Path) -> None:
     _, path = small(tmp_path)
     whole = path.read_bytes()
     for length in range(0, len(whole), 10):
@@ -236,7 +236,7 @@ def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path) -> None:
             load(path)
 
 
-def test_a_changed_byte_is_refused_or_changes_nothing(tmp_path: Path) -> None:
+def test_changed_byte_is_refused_or_has_no_effect(tmp_path: Path) -> None:
     model, path = small(tmp_path)
     whole = path.read_bytes()
     refused = 0
@@ -246,7 +246,7 @@ def test_a_changed_byte_is_refused_or_changes_nothing(tmp_path: Path) -> None:
             loaded = load(path)
         except ModelFileError:
             refused += 1
-        else:  # white space, or "version" and the like under a key of its own
+        else:  # white space, or "version" and the like under another key
             assert torch.equal(loaded.schedule.raw, model.schedule.raw)
             assert load_info(path) == INFO
     assert refused > 0.5 * len(range(0, len(whole), 7))
@@ -275,7 +275,7 @@ def test_an_edited_file_is_refused(edit: Callable[[dict], None], tmp_path: Path)
         load(path)
 
 
-def test_layout_is_no_damage(tmp_path: Path) -> None:
+def test_layout_of_the_json_does_not_matter(tmp_path: Path) -> None:
     model, path = small(tmp_path)
     path.write_text(json.dumps(json.loads(path.read_bytes()), sort_keys=True))
     assert torch.equal(load(path).schedule.raw, model.schedule.raw)
@@ -299,7 +299,9 @@ def test_layout_is_no_damage(tmp_path: Path) -> None:
         (b"1" * 10_000, "not a model file"),
     ],
 )
-def test_what_is_no_model_file_is_refused(written: bytes, message: str, tmp_path: Path) -> None:
+def test_files_that_are_no_model_files_are_refused(
+    written: bytes, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "model.json"
     path.write_bytes(written)
     with pytest.raises(ModelFileError, match=message) as raised:
@@ -308,7 +310,7 @@ def test_what_is_no_model_file_is_refused(written: bytes, message: str, tmp_path
     assert len(str(raised.value)) < 1000
 
 
-def test_absent_files_folders_and_giants_are_refused(tmp_path: Path) -> None:
+def test_missing_files_folders_and_huge_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelFileError, match="no such file"):
         load(tmp_path / "absent.json")
     with pytest.raises(ModelFileError, match="not a file"):
@@ -424,7 +426,7 @@ def test_a_forged_file_is_refused(name: str, tmp_path: Path) -> None:
         ({"prior_sd": 0.5, "initial": [1.0, 1.0]}, "`options` is"),
     ],
 )
-def test_a_network_that_cannot_be_is_refused(options: dict, message: str, tmp_path: Path) -> None:
+def test_impossible_network_is_refused(options: dict, message: str, tmp_path: Path) -> None:
     path = save(NFLFM(1), tmp_path / "model.json")
     content = json.loads(path.read_bytes())
     content["options"] |= options
@@ -435,7 +437,7 @@ def test_a_network_that_cannot_be_is_refused(options: dict, message: str, tmp_pa
 
 @pytest.mark.parametrize("option", ["time_constant", "sample_time", "hysteresis"])
 @pytest.mark.parametrize(("value", "message"), [(10**400, "finite"), (True, "`options` is")])
-def test_numbers_of_a_schedule_are_numbers(
+def test_schedule_values_must_be_numbers(
     option: str, value: Any, message: str, tmp_path: Path
 ) -> None:
     path = save(model_by_name("ALFM")(1), tmp_path / "model.json")
@@ -457,7 +459,7 @@ def test_a_wrong_unit_is_refused(tmp_path: Path) -> None:
 # Writing
 
 
-def test_what_cannot_be_told_in_json_is_not_saved(tmp_path: Path) -> None:
+def test_models_that_json_cannot_represent_are_not_saved(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     model = LFM(2)
     with pytest.raises(ValueError, match="plain JSON"):
@@ -477,9 +479,7 @@ def test_what_cannot_be_told_in_json_is_not_saved(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_is_replaced_whole_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_is_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _, path = small(tmp_path)
     before = path.read_bytes()
 
@@ -497,7 +497,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(
     assert [p.name for p in tmp_path.iterdir()] == ["small.json"]
 
 
-def test_missing_folders_are_made_and_impossible_ones_named(tmp_path: Path) -> None:
+def test_missing_folders_are_created_and_impossible_ones_named(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b" / "model.json"
     assert save(LFM(1), path) == path
     beneath_a_file = path / "model.json"

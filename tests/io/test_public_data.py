@@ -1,4 +1,4 @@
-"""Public recordings: originals as their authors lay them out become the tables of the cards."""
+"""Public recordings: the authors' original files become the tables of the data cards."""
 
 import http.client
 import io
@@ -33,14 +33,14 @@ def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def put(folder: Path, name: str, recording: str) -> Path:
-    """Place of a recording's original, its folder made."""
+    """Path of a recording's original file; its folder is created."""
     path = folder / "originals" / public_sets()[name].recordings[recording][0]
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
 def swing_pieces(q: np.ndarray, qd: np.ndarray, pieces: int) -> dict[str, np.ndarray]:
-    """A free swing as the authors' script cuts it: the last piece is shorter."""
+    """A free swing in the parts of the authors' script: the last part is shorter."""
     parts = np.empty(pieces, dtype=object)
     length = q.shape[1] // pieces + 1
     for k in range(pieces):
@@ -69,7 +69,7 @@ def test_free_swings_are_joined_and_cut_in_the_authors_order(tmp_path: Path) -> 
         np.testing.assert_allclose(qd0, qd[:, start], atol=1e-4)
 
 
-def test_servo_logs_have_a_part_after_the_release(tmp_path: Path) -> None:
+def test_servo_logs_are_cut_at_the_release(tmp_path: Path) -> None:
     count = 40
     released = np.arange(count) >= 25
     log = {
@@ -92,14 +92,14 @@ def test_servo_logs_have_a_part_after_the_release(tmp_path: Path) -> None:
     assert (dropped["tau1"] == 0).all()
 
 
-def test_without_a_network_the_address_and_the_place_are_named(tmp_path: Path) -> None:
+def test_offline_error_names_url_and_target_path(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"githubusercontent.com/forgi86.*DATA_EMPS.mat.*save it as"):
         fetch("emps", tmp_path)
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("failure", [http.client.IncompleteRead(b"x"), ConnectionResetError()])
-def test_a_download_that_breaks_off_is_named(
+def test_interrupted_download_is_named(
     failure: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Answer(io.BytesIO):
@@ -112,7 +112,7 @@ def test_a_download_that_breaks_off_is_named(
     assert not any(tmp_path.iterdir())
 
 
-def test_part_of_an_original_is_refused(tmp_path: Path) -> None:
+def test_partial_original_is_refused(tmp_path: Path) -> None:
     path = put(tmp_path, "emps", "emps_first")
     scipy.io.savemat(path, {"qm": np.linspace(0.0, 1.0, 1000) ** 2}, do_compression=True)
     whole = path.read_bytes()
@@ -122,7 +122,7 @@ def test_part_of_an_original_is_refused(tmp_path: Path) -> None:
             fetch("emps", tmp_path)
 
 
-def test_downloads_of_the_same_at_the_same_time_do_not_meet(
+def test_concurrent_downloads_do_not_interfere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     together = threading.Barrier(2)
@@ -142,7 +142,7 @@ def test_downloads_of_the_same_at_the_same_time_do_not_meet(
             one.result()
 
 
-def test_another_file_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_digest_is_refused(tmp_path: Path) -> None:
     put(tmp_path, "tribometer", "tribometer_first").write_text("<html>not found</html>\n")
     with pytest.raises(ValueError, match=r"is not what https.*fetch it again"):
         fetch("tribometer", tmp_path)
@@ -151,7 +151,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
 
 
 def original_of(source: str, table: pd.DataFrame) -> bytes:
-    """An original with a table's rows, as far as they say."""
+    """An original with the rows of a table, as far as given."""
     if source == "dfki":
         names = {"q": "pos_meas", "qd": "vel_meas", "tau": "tau_meas", "tau_cmd": "tau_con"}
         named = table.rename(columns=lambda c: names.get(c[:-1], c[:-1]) + c[-1])
@@ -191,7 +191,7 @@ def test_tables_are_those_of_the_documentation(name: str, data_dir: Path, tmp_pa
             first = round(1e3 * listed["source_t0"][recording])
             measured = table.drop(columns="time").to_numpy()
             whole[:, first : first + len(table)] = measured.T
-            # The filter of the initial state reads the 15 samples before, which are not given here.
+            # The initial-state filter uses the 15 samples before, which are not given here.
             before = np.polynomial.polynomial.polyvander(np.arange(-15, 40) / 40, 4)
             whole[:, first - 15 : first] = (
                 before[:15] @ np.linalg.lstsq(before[15:], measured[:40], rcond=None)[0]
@@ -209,10 +209,10 @@ def test_tables_are_those_of_the_documentation(name: str, data_dir: Path, tmp_pa
         for recording, table in tables.items():
             put(tmp_path, name, recording).write_bytes(original_of(chosen.source, table))
     fetched = fetch(name, tmp_path)
-    if name == "emps":  # rounded voltages move the last digit of forces
+    if name == "emps":  # rounded voltages change the last digit of forces
         written = pd.read_csv(tmp_path / "emps_first.csv.gz")
         np.testing.assert_allclose(written, tables["emps_first"], atol=3e-5)
-    elif name == "xl330":  # one log holds the lift and the drop; what is known of it is the drop
+    elif name == "xl330":  # one log contains the lift and the drop; only the drop is documented
         assert set(fetched.differing) == {"lift_and_drop_kp100", "lift_and_drop_kp400"}
     else:
         assert fetched.differing == ()

@@ -1,4 +1,4 @@
-"""Work in a process of its own: what it gives, what it says, and how it perishes."""
+"""Work in a separate process: results, error messages, crashes and limits."""
 
 import sys
 from collections.abc import Callable
@@ -24,7 +24,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits o
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Runs a module of the given body; gives the folder of its results."""
+    """Run a module with the given body and return the folder of its results."""
     monkeypatch.syspath_prepend(tmp_path)
     folder = tmp_path / "results"
     folder.mkdir()
@@ -37,24 +37,24 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     return start
 
 
-def test_results_lie_in_the_folder(run: Run) -> None:
+def test_results_are_in_the_folder(run: Run) -> None:
     folder = run('(folder / "out").write_text(task["what"])', what="Lösung")
     assert (folder / "out").read_text() == "Lösung"
 
 
-def test_temporary_files_lie_there_too(run: Run) -> None:
+def test_temporary_files_are_in_the_folder_too(run: Run) -> None:
     folder = run('open(tempfile.mkstemp()[1], "w").write("left behind")')
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_refusal_is_passed_on(run: Run) -> None:
+def test_errors_are_passed_on(run: Run) -> None:
     with pytest.raises(sandbox.InvalidFile, match="no such channel"):
         run('raise ValueError("no such channel")')
 
 
 @posix
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ("os.abort()", "SIGABRT"),
         ("os.kill(os.getpid(), 11)", "SIGSEGV"),
@@ -63,18 +63,18 @@ def test_a_refusal_is_passed_on(run: Run) -> None:
         ("bytearray(2**34)", "MemoryError"),
     ],
 )
-def test_how_it_perished_is_told(run: Run, body: str, said: str) -> None:
-    with pytest.raises(sandbox.WorkerDied, match=said):
+def test_cause_of_a_crash_is_reported(run: Run, body: str, message: str) -> None:
+    with pytest.raises(sandbox.WorkerDied, match=message):
         run(body)
 
 
 @posix
-def test_processor_time_is_bounded(run: Run) -> None:
+def test_processor_time_is_limited(run: Run) -> None:
     with pytest.raises(sandbox.WorkerDied, match="does not come to an end"):
         run("while True: pass", seconds=1.0)
 
 
-def test_waiting_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_time_is_limited(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sandbox, "BUSY", 3.0)
     with pytest.raises(sandbox.WorkerDied, match="does not come to an end"):
         run("time.sleep(600)", seconds=1.0)

@@ -1,11 +1,11 @@
-"""JSON of strangers: finite numbers only."""
+"""JSON from untrusted files: finite numbers only."""
 
 import pytest
 
 from nfriction.io.files import numbers, parse_json
 
 
-def test_what_is_json_is_read() -> None:
+def test_valid_json_is_read() -> None:
     assert parse_json(b'{"a": [1, 2.5, null, "NaN"]}') == {"a": [1, 2.5, None, "NaN"]}
     assert parse_json('{"a": 1, "a": 2}', lambda pairs: {"n": len(pairs)}) == {"n": 2}
 
@@ -17,12 +17,12 @@ def test_numbers_are_finite(number: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1,]", '{"a" 1}'])
-def test_what_is_no_json_is_refused(text: str) -> None:
+def test_invalid_json_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="line 1"):
         parse_json(text)
 
 
-def test_numbers_are_numbers_and_not_true() -> None:
+def test_booleans_are_not_numbers() -> None:
     assert numbers("x", [1, [2.5, "nan"]], words=("nan",))[1][0] == 2.5
     for bad in (True, [1, [False]], None, "1", {"a": 1}, 10**400):
         with pytest.raises(ValueError, match="`x`"):

@@ -1,4 +1,4 @@
-"""CSV in the wild: every dialect gives the same numbers, and what is ambiguous is refused."""
+"""CSV files from practice: every dialect gives the same numbers, and ambiguity is refused."""
 
 import gzip
 import itertools
@@ -41,7 +41,7 @@ def test_every_dialect_gives_the_same_numbers(
     tmp_path: Path, separator: str, comma: bool, encoding: str, ending: str
 ) -> None:
     text = written(separator, comma).replace("\n", ending)
-    # A letter beyond ASCII in a column that nobody asks for.
+    # A non-ASCII letter in an unused column.
     text = text.replace("q2", f"q2{separator}Übung", 1) if encoding == "latin-1" else text
     if encoding == "latin-1":
         lines = text.split(ending)
@@ -57,14 +57,14 @@ def test_every_dialect_gives_the_same_numbers(
     [("time{0}q1{0}q2", "[s]{0}[deg]{0}[deg]"), ("time{0}q1{0}q2", "s{0}deg{0}°"),
      ("time [s]{0}q1 [deg]{0}q2 (deg)", "")],
 )  # fmt: skip
-def test_units_in_the_file_are_followed(
+def test_units_in_the_file_are_converted(
     tmp_path: Path, separator: str, header: str, units: str
 ) -> None:
     back = read(tmp_path, written(separator, separator != ",", header, units))
     # Two roundings, of the factor and of the quotient.
     np.testing.assert_allclose(back.q, np.deg2rad(Q), rtol=4e-16)
     assert np.array_equal(back.time, TIME)
-    # The option says the same again, no more.
+    # The option repeats the unit of the file, which changes nothing.
     again = read(tmp_path, written(separator, separator != ",", header, units), degrees=True)
     assert again.digest() == back.digest()
 
@@ -76,7 +76,7 @@ def test_columns_are_mapped_with_their_units(tmp_path: Path) -> None:
     back = read(tmp_path, text, columns=mapping)
     np.testing.assert_allclose(back.q, Q * [np.pi / 180, 2 * np.pi / 8192], rtol=4e-16)
     np.testing.assert_allclose(back.time, TIME / 1000, rtol=1e-15)
-    # A header may be given with or without the unit that it holds, and own a colon.
+    # A header may be given with or without its unit, and may contain a colon.
     text = written(";", True, "t [ms]{0}axis:1 [deg]{0}axis:2 [deg]")
     for names in ({"time": "t", "q1": "axis:1", "q2": "axis:2"},
                   {"time": "t [ms]:ms", "q1": "axis:1 [deg]", "q2": "axis:2:deg"}):  # fmt: skip
@@ -84,15 +84,15 @@ def test_columns_are_mapped_with_their_units(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_titles_above_the_header_are_passed_over(tmp_path: Path, separator: str) -> None:
+def test_titles_above_the_header_are_skipped(tmp_path: Path, separator: str) -> None:
     title = f"Bench 7{2 * separator}\n\nsecond run\n"
     assert np.array_equal(read(tmp_path, title + written(separator, False)).q, Q)
-    # A header of one word is none of a table, and numbers are no header.
+    # A single word is no header of a table, and neither are numbers.
     with pytest.raises(ValueError, match=r"header|missing"):
         read(tmp_path, written(separator, False, header="time"))
 
 
-def test_a_name_may_be_given_without_a_unit_that_is_not_known(tmp_path: Path) -> None:
+def test_column_may_be_named_without_its_unknown_unit(tmp_path: Path) -> None:
     text = written(";", False, header="time{0}enc [inc]{0}enc2 (left)")
     columns = {"q1": "enc:counts/1000", "q2": "enc2"}
     assert np.array_equal(read(tmp_path, text, columns=columns).q[:, 1], Q[:, 1])
@@ -101,7 +101,7 @@ def test_a_name_may_be_given_without_a_unit_that_is_not_known(tmp_path: Path) ->
         read(tmp_path, text, columns={"q1": "enc"})
 
 
-def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
+def test_length_units_define_a_sliding_axis(tmp_path: Path) -> None:
     text = written(",", False, "time{0}x{0}y")
     back = read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"})
     assert back.unit == "m"
@@ -112,7 +112,7 @@ def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"}, unit="rad")
 
 
-def test_a_unit_at_the_end_of_a_name_holds_unless_another_is_stated(tmp_path: Path) -> None:
+def test_unit_suffix_applies_unless_another_unit_is_stated(tmp_path: Path) -> None:
     text = written(",", False, "t_ms{0}x_mm{0}y_mm")
     back = read(tmp_path, text, columns={"time": "t_ms", "q1": "x_mm", "q2": "y_mm:m"})
     np.testing.assert_allclose(back.q, Q * [1e-3, 1.0], rtol=4e-16)
@@ -128,7 +128,7 @@ def test_only_whole_lines_are_comments(tmp_path: Path, separator: str) -> None:
     assert str(back.convention) == "absolute,hanging"
 
 
-def test_degrees_said_of_the_whole_file_are_converted_when_asked(tmp_path: Path) -> None:
+def test_degrees_option_converts_the_whole_file(tmp_path: Path) -> None:
     text = "# unit: deg\n" + written(",", False)
     with pytest.raises(ValueError, match=r"got 'deg'; .*converts degrees"):
         read(tmp_path, text)
@@ -137,7 +137,7 @@ def test_degrees_said_of_the_whole_file_are_converted_when_asked(tmp_path: Path)
     np.testing.assert_allclose(back.q, np.deg2rad(Q), rtol=4e-16)
 
 
-def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
+def test_trailing_separator_is_no_column(tmp_path: Path) -> None:
     text = written(";", True).replace("\n", ";\n")
     assert np.array_equal(read(tmp_path, text).q, Q)
 
@@ -163,7 +163,7 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time;q1\n" + '0;"1\n', "EOF inside string"),
     ],
 )  # fmt: skip
-def test_what_can_be_read_in_two_ways_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_ambiguous_numbers_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         read(tmp_path, text)
     assert "run.csv" in str(caught.value)
@@ -181,7 +181,7 @@ def log(q1: list[str], time: list[str] | None = None, separator: str = ";") -> s
 
 COUNTS = np.rint(35_000 + 1200 * np.cos(np.arange(40) / 7)).astype(int)
 IN_COUNTS = {"time": "time:ms", "q1": "q1:counts/40000"}
-# All that says which sign is which is a number elsewhere, or the unit.
+# The only numbers that would settle the decimal sign are in unused columns or in a unit.
 BY_COLUMN = {
     "more than a million": ([0, 999, 12_345, 1_234_567, 1_234_000, 8, 9, 10], None),
     "a point elsewhere": (COUNTS.tolist(), [f"{k / 1000:.3f}" for k in range(40)]),
@@ -190,7 +190,7 @@ BY_COLUMN = {
 
 @pytest.mark.parametrize("separator", [",", "."])
 @pytest.mark.parametrize("case", BY_COLUMN)
-def test_thousands_are_recognised_by_the_whole_file(
+def test_thousands_separators_are_recognised_from_the_whole_file(
     tmp_path: Path, separator: str, case: str, recwarn: pytest.WarningsRecorder
 ) -> None:
     values, time = BY_COLUMN[case]
@@ -202,7 +202,9 @@ def test_thousands_are_recognised_by_the_whole_file(
 
 
 @pytest.mark.parametrize("separator", [",", "."])
-def test_counts_are_whole(tmp_path: Path, separator: str, recwarn: pytest.WarningsRecorder) -> None:
+def test_counters_are_integers(
+    tmp_path: Path, separator: str, recwarn: pytest.WarningsRecorder
+) -> None:
     text = log([thousands(int(x), separator) for x in COUNTS])
     back = read(tmp_path, text, columns=IN_COUNTS)
     np.testing.assert_allclose(back.q[:, 0], COUNTS * 2 * np.pi / 40_000, rtol=1e-15)
@@ -212,7 +214,9 @@ def test_counts_are_whole(tmp_path: Path, separator: str, recwarn: pytest.Warnin
 
 
 @pytest.mark.parametrize("separator", [",", "."])
-def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separator: str) -> None:
+def test_ambiguous_thousands_separators_raise_an_error_with_remedy(
+    tmp_path: Path, separator: str
+) -> None:
     text = log([thousands(int(x), separator) for x in COUNTS])
     with pytest.warns(
         RecordingWarning, match=r"q1 .*assumed that .*3[56].* is a decimal sign; .*# decimal"
@@ -226,14 +230,16 @@ def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separ
 
 
 @pytest.mark.parametrize("separator", [",", "."])
-def test_a_motion_through_a_thousand_is_followed_and_said(tmp_path: Path, separator: str) -> None:
+def test_motion_through_a_thousand_is_resolved_with_a_warning(
+    tmp_path: Path, separator: str
+) -> None:
     counts = COUNTS - 34_900
     text = log([thousands(int(x), separator) for x in counts])
     with pytest.warns(RecordingWarning, match=r"assumed that .* separates thousands"):
         assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], counts)
 
 
-def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
+def test_thousands_and_decimal_separators_in_one_number_are_read(tmp_path: Path) -> None:
     values = [999.5, 1000.25, 1234.5, 0, 1, 2, 3, -12345.75]
     english = log([f"{x:,}" for x in values])
     german = english.translate({ord(","): ".", ord("."): ","})
@@ -241,10 +247,10 @@ def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
         assert np.array_equal(read(tmp_path, text).q[:, 0], values)
 
 
-def test_numbers_in_quotation_marks_may_hold_commas(tmp_path: Path) -> None:
+def test_numbers_in_quotation_marks_may_contain_commas(tmp_path: Path) -> None:
     text = log([f'"{x:,}"' for x in [0, *COUNTS.tolist(), 1_234_567]], separator=",")
     assert np.array_equal(read(tmp_path, text, unit="m").q[:, 0], [0, *COUNTS, 1_234_567])
-    # What nobody asks for decides nothing.
+    # Unused columns have no influence.
     noted = written(",", False, "time{0}q1{0}q2{0}note").replace("\n", ',"0,5"\n')
     assert np.array_equal(read(tmp_path, noted.replace(',"0,5"', "", 1)).q, Q)
 
@@ -256,7 +262,7 @@ def test_numbers_in_quotation_marks_may_hold_commas(tmp_path: Path) -> None:
      log([f"{x}.125" for x in range(1020, 1030)]),
      log([f"{x}.125" for x in range(20)])],
 )  # fmt: skip
-def test_decimal_points_before_three_digits_are_taken_silently(
+def test_decimal_points_before_three_digits_raise_no_warning(
     tmp_path: Path, text: str, recwarn: pytest.WarningsRecorder
 ) -> None:
     for written_so in (text, text.replace(".", ",")):
@@ -272,7 +278,7 @@ def test_decimal_points_before_three_digits_are_taken_silently(
      ("# decimal: comma\ntime;q1\n0;0,5\n", "must state , or . as the sign, got 'comma'"),
      ("time;q1;q2\n0;1,234,567;1.234.567\n", "column q2 has decimal commas and column q1")],
 )  # fmt: skip
-def test_signs_that_contradict_are_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_contradictory_separators_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read(tmp_path, text)
 
@@ -287,27 +293,29 @@ def test_signs_that_contradict_are_refused(tmp_path: Path, text: str, message: s
         ({"joint": "enc"}, "`columns` maps time, q1"),
     ],
 )
-def test_mappings_that_lead_nowhere_are_named(
+def test_mappings_to_missing_columns_are_named(
     tmp_path: Path, columns: dict[str, str], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         read(tmp_path, "time,enc\n" + "".join(f"{k},0\n" for k in range(9)), columns=columns)
 
 
-def test_a_unit_in_brackets_that_is_not_known_is_told(
+def test_unknown_unit_in_brackets_is_reported(
     tmp_path: Path, recwarn: pytest.WarningsRecorder
 ) -> None:
     text = written(",", False, "time{0}angle [gon]{0}joint[2]")
     columns = {"q1": "angle [gon]", "q2": "joint[2]"}
-    with pytest.warns(RecordingWarning, match=r"angle \[gon\]: 'gon' is not a known unit") as said:
+    with pytest.warns(
+        RecordingWarning, match=r"angle \[gon\]: 'gon' is not a known unit"
+    ) as caught:
         assert np.array_equal(read(tmp_path, text, columns=columns).q, Q)
-    assert not [w for w in said if "joint[2]" in str(w.message)]  # an index
+    assert not [w for w in caught if "joint[2]" in str(w.message)]  # an index
     recwarn.clear()
     read(tmp_path, text, columns=columns | {"q1": "angle [gon]:mrad"})
     assert not [w for w in recwarn if "gon" in str(w.message)]
 
 
-def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
+def test_contradictory_units_are_refused(tmp_path: Path) -> None:
     text = written(",", False, "time [s]{0}q1 [rad]{0}q2 [rad]")
     with pytest.raises(ValueError, match=r"`degrees=True`, but column q1 \[rad\]"):
         read(tmp_path, text, degrees=True)
@@ -315,7 +323,7 @@ def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
         read(tmp_path, text, columns={"q1": "q1 [rad]:deg"})
 
 
-def test_a_german_row_of_units_is_read_and_own_words_give_way(tmp_path: Path) -> None:
+def test_german_row_of_units_is_read_and_options_take_precedence(tmp_path: Path) -> None:
     rows = "".join(f"{k};{10 * k},5;{k}\n" for k in range(9))
     columns = {"time": "Zeit", "q1": "Winkel", "q2": "Arm:mrad"}
     found = read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns)
@@ -326,9 +334,7 @@ def test_a_german_row_of_units_is_read_and_own_words_give_way(tmp_path: Path) ->
         read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns | {"q2": "Arm"})
 
 
-def test_what_unpacks_to_far_more_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decompression_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(b"time,q1\n" + b"0,0\n" * 100_000))
     monkeypatch.setattr("nfriction.io.formats.LARGEST", 100_000)
@@ -359,7 +365,7 @@ def survives(path: Path, content: bytes) -> None:
 
 @fuzzing
 @given(content=st.binary(min_size=1, max_size=400))
-def test_bytes_of_any_kind_are_read_or_refused(tmp_path: Path, content: bytes) -> None:
+def test_arbitrary_bytes_are_read_or_refused(tmp_path: Path, content: bytes) -> None:
     survives(tmp_path / "run.csv", content)
 
 

@@ -1,4 +1,4 @@
-"""Units: every spelling leads to SI, and nothing else passes for a unit."""
+"""Units: every spelling is converted to SI, and nothing else is accepted as a unit."""
 
 import math
 
@@ -35,7 +35,7 @@ from nfriction.io.formats.selection import is_unit, slides, to_si
         ("tau", "N m", 1.0),
     ],
 )
-def test_one_of_a_unit_in_si(kind: str, unit: str, value: float) -> None:
+def test_units_are_converted_to_si(kind: str, unit: str, value: float) -> None:
     assert is_unit(unit)
     # Two roundings: the factor's and the quotient's.
     np.testing.assert_allclose(to_si(kind, np.array([1.0, -3.0]), unit), [value, -3 * value], 4e-16)
@@ -51,11 +51,11 @@ def test_milliseconds_are_exact() -> None:
     [("time", "deg"), ("q", "ms"), ("q", "deg/s"), ("qd", "counts/8192"), ("tau", "m"),
      ("q", "counts/0"), ("q", "counts/"), ("q", "gon"), ("q", "")],
 )  # fmt: skip
-def test_a_unit_of_another_kind_is_refused(kind: str, unit: str) -> None:
+def test_unit_of_another_quantity_is_refused(kind: str, unit: str) -> None:
     with pytest.raises(ValueError, match=f"is not a unit of {kind}; known units are"):
         to_si(kind, np.ones(2), unit)
 
 
-def test_lengths_are_told_from_angles() -> None:
+def test_lengths_are_distinguished_from_angles() -> None:
     assert [u for u in ("m", "cm", "um", "[mm]", "deg", "rad", "counts/4") if slides(u)] == [
         "m", "cm", "um", "[mm]"]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Updates of prior precisions are at rest where the evidence of a linear model is stationary."""
+"""Fixed points of the prior precision updates maximise the evidence of a linear model."""
 
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ def log_evidence(precision):
     return volume - 0.5 * w @ (prior + data) @ w + slope @ w
 
 
-def test_slopes_are_those_of_the_log_evidence():
+def test_gradients_equal_those_of_the_log_evidence():
     data, known, _, groups = problem()
     precision = torch.tensor([2.0, 0.3], dtype=torch.float64)
     w, _ = optimum(precision)
@@ -43,7 +43,7 @@ def test_slopes_are_those_of_the_log_evidence():
     assert ((found.gamma > 0) & (found.gamma < 3)).all()
 
 
-def test_updates_raise_the_evidence_to_its_maximum():
+def test_updates_maximise_the_evidence():
     data, known, _, groups = problem()
     precision = torch.ones(2, dtype=torch.float64)
     seen = []

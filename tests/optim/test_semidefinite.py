@@ -1,4 +1,4 @@
-"""Positive semidefinite systems, whole and block by block."""
+"""Positive semidefinite systems, dense and block by block."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ SHARED, SIZE, COUNT = 3, 2, 50
 
 
 def bordered(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """A Jacobian of windows with states of their own, and residuals."""
+    """A Jacobian of windows with separate states, and residuals."""
     g = torch.Generator().manual_seed(seed)
     rows = torch.zeros(COUNT, 6, SHARED + COUNT * SIZE, dtype=F64)
     rows[..., :SHARED] = torch.randn(COUNT, 6, SHARED, generator=g, dtype=F64)
@@ -22,7 +22,7 @@ def bordered(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return rows.flatten(0, 1), torch.randn(COUNT * 6, generator=g, dtype=F64)
 
 
-def test_block_by_block_it_is_the_whole_solution():
+def test_blockwise_solution_equals_the_dense_one():
     jacobian, r = bordered()
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
     found = solve_arrowhead(matrix, vector, SHARED, SIZE)
@@ -31,8 +31,8 @@ def test_block_by_block_it_is_the_whole_solution():
 
 
 @pytest.mark.parametrize("lost", [0, SHARED + 4])
-def test_what_nothing_tells_stays_at_zero(lost):
-    """A shared unknown, or one of a block, without any data: the shortest solution."""
+def test_undetermined_unknowns_are_zero(lost):
+    """A shared unknown, or one of a block, without any data: the minimum-norm solution."""
     jacobian, r = bordered()
     jacobian[:, lost] = 0.0
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
@@ -42,8 +42,8 @@ def test_what_nothing_tells_stays_at_zero(lost):
 
 
 @pytest.mark.parametrize("bound", [float("inf"), 0.05])
-def test_a_search_goes_the_same_way_with_blocks_and_without(bound, monkeypatch):
-    """Also where a shared unknown ends at a bound."""
+def test_search_takes_the_same_steps_with_and_without_blocks(bound, monkeypatch):
+    """Also if a shared unknown ends at a bound."""
     monkeypatch.setattr("nfriction.optim.bounded_qp.MANY_BLOCKS", COUNT)
     jacobian, r = bordered()
     upper = torch.full((jacobian.shape[1],), torch.inf, dtype=F64)
@@ -65,7 +65,7 @@ def test_a_search_goes_the_same_way_with_blocks_and_without(bound, monkeypatch):
     assert parts.converged
 
 
-def test_an_indefinite_block_falls_back_on_the_whole():
+def test_indefinite_block_falls_back_to_the_dense_solver():
     jacobian, r = bordered()
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
     at = slice(SHARED, SHARED + SIZE)

@@ -1,4 +1,4 @@
-"""The positioning axis speaks the same language as the chain."""
+"""The positioning axis has the same interface as the chain."""
 
 import json
 
@@ -8,7 +8,7 @@ import torch
 from nfriction.plant import LinearAxis
 
 
-def test_newton() -> None:
+def test_axis_follows_newtons_law() -> None:
     axis = LinearAxis(4.0, torque_offset=2.0)
     q, qd, tau = torch.randn(3, 5, 1, dtype=torch.float64)
     qdd = axis(q, qd, tau)
@@ -25,7 +25,7 @@ def test_newton() -> None:
     assert (axis.unit, axis.joints, axis.has_drag) == ("m", 1, False)
 
 
-def test_an_asymmetric_axis_resists_more_one_way() -> None:
+def test_asymmetric_axis_has_direction_dependent_friction() -> None:
     axis = LinearAxis(4.0, torque_offset=2.0)
     crooked = axis.replace(asymmetry=torch.tensor([3.0], dtype=torch.float64))
     q, qd, tau = torch.randn(3, 5, 1, dtype=torch.float64)
@@ -48,7 +48,7 @@ def test_replace_broadcasts_and_carries_gradients() -> None:
     assert axis.mass_matrix(x).shape == (2, 3, 1, 1)
 
 
-def test_export_and_round_trip() -> None:
+def test_axis_is_exported_and_restored_from_a_dictionary() -> None:
     axis = LinearAxis(95.0, torque_offset=3.0, name="axis").replace(mass=torch.tensor([90.0]))
     again = LinearAxis.from_dict(json.loads(json.dumps(axis.to_dict())))
     assert again.mass.item() == 90

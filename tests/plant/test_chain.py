@@ -1,4 +1,4 @@
-"""Laws of the chain's equations of motion, in any pose and for any masses."""
+"""Properties of the chain's equations of motion, in any pose and for any masses."""
 
 import json
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def states(joints: int, batch: tuple[int, ...] = (20,), seed: int = 0) -> tuple[
 
 
 def every_kind(arm: Any) -> PendulumChain:
-    """Offsets, gains, rotors, full tensors and, with a fixed arm, drag: all terms there are."""
+    """Offsets, gains, rotors, full tensors and, with a fixed arm, drag: all existing terms."""
     rig = rigs.tlrip(arm, FULL_TENSOR)
     joints, links = torch.linspace(0.1, 0.2, rig.joints).double(), torch.ones(3).double()
     drag = {} if rig.first_link else {"drag_linear": 0.02 * links, "drag_quadratic": 0.03 * links}
@@ -39,7 +39,7 @@ def every_kind(arm: Any) -> PendulumChain:
 
 
 def with_encoders(rig: PendulumChain) -> PendulumChain:
-    """Read by eccentric encoders."""
+    """The same chain with eccentric encoders."""
     joints = torch.linspace(0.01, 0.02, rig.joints).double()
     return rig.replace(encoder_cosine=joints, encoder_sine=-joints)
 
@@ -53,7 +53,7 @@ def chains(draw: Callable[[Any], Any]) -> PendulumChain:
 
     mass, length = values(0.05, 10), values(0.05, 2)
     com = [share * size for share, size in zip(values(0.1, 1.2), length, strict=True)]
-    # Slender rods: what a body of that length may have about its mass centre.
+    # Slender rods: the inertia of a body of that length about its mass centre.
     inertia = [f * m * s**2 for f, m, s in zip(values(0, 0.2), mass, length, strict=True)]
     arm = draw(st.sampled_from([None, Arm(0.1, 0.3), Arm(2.0, 1.0)]))
     armature = draw(st.sampled_from([None, [0.01] * (links + (arm is not None))]))
@@ -69,10 +69,10 @@ def test_mass_matrix_is_symmetric_positive_definite(rig: PendulumChain, seed: in
 
 
 @given(rig=chains(), seed=st.integers(0, 1000))
-def test_inverse_dynamics_undoes_forward_dynamics(rig: PendulumChain, seed: int) -> None:
+def test_inverse_dynamics_inverts_forward_dynamics(rig: PendulumChain, seed: int) -> None:
     q, qd, tau = states(rig.joints, seed=seed)
     qdd = rig(q, qd, tau)
-    # The error of a solve grows with the condition number, and stays small against each term.
+    # The error of a solve grows with the condition number, and is small relative to each term.
     scale = (rig.mass_matrix(q).abs() @ qdd.abs()[..., None])[..., 0] + rig.bias(q, qd).abs()
     condition = torch.linalg.cond(rig.mass_matrix(q)).amax()
     error = (rig.inverse_dynamics(q, qd, qdd) - tau).abs()
@@ -119,20 +119,20 @@ def test_bias_follows_from_the_energies(arm: Any) -> None:
     torch.testing.assert_close(torch.func.grad(lagrangian, argnums=1)(q, qd), momentum(q, qd))
 
 
-def test_load_is_one_at_rest_in_line_and_none_at_rest_level() -> None:
+def test_load_at_rest_is_one_hanging_and_zero_horizontal() -> None:
     rig = rigs.tlrip("free")
     still = torch.zeros(4).double()
     torch.testing.assert_close(rig.load(still, still), torch.ones(4).double())
     level = torch.tensor([0.3, torch.pi / 2, 0, 0]).double()
     expected = torch.tensor([1.0, 0, 0, 0]).double()
     torch.testing.assert_close(rig.load(level, still), expected, atol=1e-7, rtol=0)
-    # Hanging and swinging adds m l qd^2: N / (m g) = 1 + l qd^2 / g.
+    # A swing through hanging adds m l qd^2: N / (m g) = 1 + l qd^2 / g.
     hanging, qd = torch.tensor([0, torch.pi, 0, 0]).double(), torch.tensor([9.0, 2, 0, 0]).double()
     swing = 1 + 0.2675 / 2 * 4 / 9.81
     assert rig.load(hanging, qd)[1].item() == pytest.approx(swing)
 
 
-def test_one_joint_s_damping_gives_the_papers_stability_bounds() -> None:
+def test_damping_of_one_joint_gives_the_papers_stability_bounds() -> None:
     bound = 2.785 / (1e-3 * rigs.tlrip().decay_rate(torch.eye(3).double()))
     torch.testing.assert_close(bound, torch.tensor([247.0, 77, 77]).double(), rtol=0.01, atol=0)
 
@@ -147,21 +147,21 @@ def test_decay_rates_bound_random_poses(arm: Any) -> None:
         gear = rig.torque_gain * (1.0 + rig.gear_loss)
         found = torch.linalg.inv(rig.mass_matrix(q)) @ torch.diag(gear * slopes)
         fastest = torch.linalg.eigvals(found).real.amax()
-        # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
+        # The grid's steps of 15 degrees for three angles miss the maximum by at most one percent.
         assert fastest <= 1.01 * rig.decay_rate(slopes)
         assert fastest >= 0.8 * rig.decay_rate(slopes)
     together = rig.decay_rate(damping)
     torch.testing.assert_close(together, torch.stack([rig.decay_rate(d) for d in damping]))
 
 
-def test_decay_rates_of_a_long_chain_look_at_few_poses() -> None:
+def test_decay_rates_of_a_long_chain_use_few_poses() -> None:
     rig = PendulumChain([0.1] * 20, [0.1] * 20, inertia=[1e-4] * 20)
     damping = torch.ones(20).double()
     straight = torch.linalg.inv(rig.mass_matrix(torch.zeros(20).double()))
     assert rig.decay_rate(damping) >= torch.linalg.eigvalsh(straight).amax()
 
 
-def test_decay_rates_follow_the_values_of_the_plant() -> None:
+def test_decay_rates_depend_on_the_values_of_the_plant() -> None:
     rig, ones = rigs.multiarm_double(), torch.ones(2).double()
     before = rig.decay_rate(ones)
     rig.inertia_coupling *= 2.0
@@ -169,7 +169,7 @@ def test_decay_rates_follow_the_values_of_the_plant() -> None:
     heavy = rig.replace(inertia_coupling=4.0 * rig.inertia_coupling)
     torch.testing.assert_close(heavy.decay_rate(ones), before / 8.0)
     torch.testing.assert_close(rig.decay_rate(ones), before / 2.0)
-    # Negative slopes decay nothing, and what is no number is no rate.
+    # With negative damping nothing decays, and NaN damping gives NaN.
     torch.testing.assert_close(rig.decay_rate(ones - torch.tensor([0.0, 3.0])),
                                rig.decay_rate(torch.tensor([1.0, 0.0]).double()))  # fmt: skip
     assert rig.decay_rate(ones * torch.nan).isnan()
@@ -177,7 +177,7 @@ def test_decay_rates_follow_the_values_of_the_plant() -> None:
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_gradients_of_both_modes(arm: Any) -> None:
+def test_forward_and_reverse_gradients_agree(arm: Any) -> None:
     rig = with_encoders(every_kind(arm))
     names = ["inertia_coupling", "gravity_moment", "armature", "angle_offset", "torque_offset"]
     names += ["torque_gain", "gear_loss", "encoder_cosine", "encoder_sine"]
@@ -225,7 +225,7 @@ def test_a_single_link_keeps_the_batch() -> None:
     assert rig.energy(q, qd)[0].shape == (2, 4)
 
 
-def test_replace_leaves_the_original_alone_and_refuses_strangers() -> None:
+def test_replace_keeps_the_original_and_refuses_unknown_names() -> None:
     rig = rigs.tlrip()
     before = {name: value.clone() for name, value in rig.named_buffers()}
     changed = rig.replace(torque_offset=torch.ones(3).double(), drag_linear=torch.ones(3).double())
@@ -266,7 +266,7 @@ def test_buffers_replaced_by_one_tensor_keep_their_names() -> None:
     assert dragged.replace(drag_linear=both).has_drag
 
 
-def test_gears_stay_when_something_else_is_replaced_and_are_refused_where_they_give_power() -> None:
+def test_replace_keeps_gears_and_refuses_gears_that_generate_power() -> None:
     rig, loss = rigs.tlrip(), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     at = states(3)
     lossy = rig.replace(gear_loss=loss)
@@ -281,7 +281,7 @@ def test_gears_stay_when_something_else_is_replaced_and_are_refused_where_they_g
         PendulumChain.from_dict(rig.to_dict() | {"buffers": {"torque_offset": [float("nan")] * 3}})
 
 
-def test_dtype_follows() -> None:
+def test_dtype_follows_the_buffers() -> None:
     rig = rigs.tlrip("free").float()
     q, qd, tau = (x.float() for x in states(4))
     assert rig(q, qd, tau).dtype == torch.float32
@@ -303,7 +303,7 @@ def test_round_trip_through_plain_numbers() -> None:
 
 
 def test_chain_formula_of_the_multiarm_bench() -> None:
-    """A_ii = I_i + m_i a_i^2 + later masses L_i^2, and so on, as the source writes them."""
+    """A_ii = I_i + m_i a_i^2 + later masses L_i^2, and so on, as in the source."""
     rig = rigs.multiarm_triple()
     m, a = np.array([0.258172, 0.279428, 0.118624]), np.array([0.16, 0.202939, 0.183709])
     length, inertia = np.array([0.1728, 0.2287, 0.0]), [1.00043e-4, 3.14160e-4, 1.68739e-4]
@@ -356,7 +356,7 @@ def test_impossible_inertia_warns_and_wrong_shapes_are_refused() -> None:
         Arm(inertia=0.0, length=1.0)
 
 
-def test_a_bearing_carries_all_links_beyond_it() -> None:
+def test_bearing_carries_all_outboard_links() -> None:
     """Newton's law of the mass centres, at the accelerations of the frictionless motion."""
     mass, length, com = [0.5, 0.4, 0.2], [0.3, 0.25, 0.2], [0.1, 0.2, 0.05]
     rig = PendulumChain(mass, length, com, [1e-3] * 3, normal_load="bearing")

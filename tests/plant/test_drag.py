@@ -1,4 +1,4 @@
-"""Air drag: closed form against quadrature, and never a source of energy."""
+"""Air drag: closed form compared with quadrature, and dissipation."""
 
 import math
 
@@ -15,7 +15,7 @@ SPEEDS = st.floats(-20, 20).filter(lambda v: v == 0 or abs(v) > 1e-9)
 
 
 @given(start=SPEEDS, end=SPEEDS)
-def test_moments_are_the_integrals(start: float, end: float) -> None:
+def test_moments_equal_the_integrals(start: float, end: float) -> None:
     zero = start / (start - end) if start * end < 0 else 0.5
     mean = first = 0.0
     nodes, weights = np.polynomial.legendre.leggauss(3)  # exact for cubics
@@ -52,8 +52,8 @@ def by_quadrature(rig: PendulumChain, q: np.ndarray, qd: np.ndarray) -> np.ndarr
     points = 4000
     for i in range(3):
         s = (np.arange(points) + 0.5) / points * length[i]
-        normal = np.array([math.cos(phi[i]), -math.sin(phi[i])])  # across link i, growing phi
-        jacobian = np.zeros((3, points))  # of the speed across the link, per absolute rate
+        normal = np.array([math.cos(phi[i]), -math.sin(phi[i])])  # along link i, for increasing phi
+        jacobian = np.zeros((3, points))  # of the transverse speed, per absolute rate
         for j in range(i):
             tangent = np.array([math.cos(phi[j]), -math.sin(phi[j])])
             jacobian[j] = length[j] * (tangent @ normal)
@@ -77,15 +77,15 @@ def test_drag_equals_an_independent_quadrature() -> None:
 
 
 @given(k=st.lists(st.floats(0, 5), min_size=6, max_size=6), seed=st.integers(0, 10_000))
-def test_drag_never_feeds_energy(k: list[float], seed: int) -> None:
+def test_drag_dissipates_energy(k: list[float], seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     q, qd = 5 * torch.randn(2, 30, 3, dtype=torch.float64, generator=generator)
     drag = dragged(k[:3], k[3:]).bias(q, qd) - rigs.multiarm_triple().bias(q, qd)
-    # The difference of two biases carries their rounding, times a rate of about 10 rad/s.
+    # The difference of two bias vectors has their rounding errors, times a rate of about 10 rad/s.
     assert ((drag * qd).sum(-1) >= -1e-10).all()
 
 
-def test_single_link_in_closed_form() -> None:
+def test_drag_of_a_single_link_equals_the_closed_form() -> None:
     rig = rigs.multiarm_single()
     k1, k2, qd = 0.2, 0.3, torch.tensor([-4.0]).double()
     pulled = rig.replace(drag_linear=torch.tensor([k1]), drag_quadratic=torch.tensor([k2]))

@@ -1,4 +1,4 @@
-"""The unrolled solve against LAPACK; joint and absolute coordinates are inverse to each other."""
+"""The unrolled solve compared with LAPACK; joint and absolute coordinates are inverse maps."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ from nfriction.plant.dynamics import (
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
-def test_solve_and_multiply(size: int) -> None:
+def test_unrolled_solve_and_product_equal_lapack(size: int) -> None:
     generator = torch.Generator().manual_seed(size)
     root = torch.randn(8, size, size, dtype=torch.float64, generator=generator)
     matrix = root @ root.mT + 0.1 * torch.eye(size)
@@ -38,7 +38,7 @@ def test_entries_of_different_shapes_broadcast() -> None:
 
 
 @pytest.mark.parametrize(("size", "first"), [(1, 0), (3, 0), (2, 1), (4, 1)])
-def test_coordinate_changes(size: int, first: int) -> None:
+def test_coordinate_changes_are_inverse(size: int, first: int) -> None:
     generator = torch.Generator().manual_seed(0)
     motion, force = torch.randn(2, size, dtype=torch.float64, generator=generator)
     q, tau = list(motion.unbind()), list(force.unbind())

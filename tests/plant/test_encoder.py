@@ -1,4 +1,4 @@
-"""Eccentric encoders: another way to write the same motion."""
+"""Eccentric encoders are a change of coordinates of the same motion."""
 
 import math
 
@@ -26,8 +26,8 @@ def readings(rig: PendulumChain, q: Tensor) -> Tensor:
     return read
 
 
-def test_a_reading_is_off_by_a_sine_of_the_angle() -> None:
-    """q + e sin(q + delta), less its value at hanging, but for the square of e."""
+def test_reading_error_is_a_sine_of_the_angle() -> None:
+    """q + e sin(q + delta), less its value at hanging, to first order in e."""
     rig = rigs.tlrip()
     q = torch.linspace(-3, 3, 50, dtype=F64)[:, None] + torch.tensor([math.pi, 0, 0], dtype=F64)
     size, phase = torch.hypot(COSINE, SINE), torch.atan2(COSINE, SINE)
@@ -36,7 +36,7 @@ def test_a_reading_is_off_by_a_sine_of_the_angle() -> None:
     assert float((readings(rig, q) - q - off).abs().max()) < 2 * float(size.max()) ** 2
 
 
-def test_at_rest_hanging_an_encoder_reads_its_zero() -> None:
+def test_encoder_reads_zero_when_hanging() -> None:
     for rig in (rigs.tlrip(), rigs.multiarm_triple()):
         hanging = torch.tensor([math.pi, 0.0, 0.0], dtype=F64)
         still = torch.zeros(3, dtype=F64)
@@ -45,7 +45,7 @@ def test_at_rest_hanging_an_encoder_reads_its_zero() -> None:
         )
 
 
-def test_the_motion_is_the_same_read_otherwise() -> None:
+def test_eccentric_encoders_do_not_change_the_motion() -> None:
     rig = rigs.tlrip()
     q0, qd0 = torch.tensor([[2.0, 0.6, -0.4], [0.5, -0.2, 0.9]], dtype=F64)
     true = rollout(rig, None, q0, qd0, steps=500, gradients=False)
@@ -54,12 +54,12 @@ def test_the_motion_is_the_same_read_otherwise() -> None:
     found = rollout(
         eccentric(rig), None, read[0], qd0 / slope[0], steps=500, gradients=False
     )  # fmt: skip
-    # Runge-Kutta steps in other coordinates differ by their error.
+    # Runge-Kutta steps in other coordinates differ by their integration error.
     torch.testing.assert_close(found.q, read, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("arm", ["fixed", "free"])
-def test_dynamics_invert_each_other_and_keep_energy(arm: str) -> None:
+def test_dynamics_are_inverse_and_conserve_energy(arm: str) -> None:
     rig = rigs.tlrip(arm)  # type: ignore[arg-type]
     joints = torch.linspace(1e-3, 3e-3, rig.joints, dtype=F64)
     rig = rig.replace(encoder_cosine=joints, encoder_sine=-joints)
@@ -70,7 +70,7 @@ def test_dynamics_invert_each_other_and_keep_energy(arm: str) -> None:
     assert float((energy - energy[0]).abs().max()) < 1e-6 * float(energy.abs().max())
 
 
-def test_it_goes_through_a_rig_file() -> None:
+def test_rig_file_round_trip_is_exact() -> None:
     rig = eccentric(rigs.tlrip())
     again = PendulumChain.from_dict(rig.to_dict())
     assert again.has_eccentricity

@@ -1,4 +1,4 @@
-"""What a drive's torque becomes behind its gear."""
+"""Joint torque from the drive's torque through a gear."""
 
 import torch
 
@@ -8,7 +8,7 @@ F64 = torch.float64
 GAIN, LOSS = torch.tensor([1.1, 0.9], dtype=F64), torch.tensor([0.1, 0.4], dtype=F64)
 
 
-def test_what_is_demanded_undoes_what_is_joint_torque():
+def test_drive_torque_inverts_joint_torque():
     random = torch.Generator().manual_seed(0)
     tau, qd = torch.randn(2, 200, 2, dtype=F64, generator=random)
     qd = qd * torch.logspace(-3, 1, 200, dtype=F64).unsqueeze(-1)
@@ -16,7 +16,7 @@ def test_what_is_demanded_undoes_what_is_joint_torque():
     torch.testing.assert_close(motor_torque(there, qd, GAIN, LOSS), tau, rtol=1e-13, atol=1e-15)
 
 
-def test_a_gear_takes_power_whichever_side_drives_and_none_at_rest():
+def test_gear_dissipates_power_in_both_directions_and_none_at_rest():
     fast = torch.tensor([[5.0, 5.0], [-5.0, -5.0]], dtype=F64)
     for sign in (1.0, -1.0):
         tau = torch.full((2, 2), 2.0 * sign, dtype=F64)

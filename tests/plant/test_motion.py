@@ -22,7 +22,7 @@ FULL_TENSOR = [
 
 @torch.no_grad()
 def rk4(rig: PendulumChain, q: Tensor, qd: Tensor, dt: float, steps: int) -> tuple[Tensor, Tensor]:
-    """Positions and rates after each step of classical RK4, free of torques, time first."""
+    """Positions and rates after each step of classical RK4, without torques, time first."""
     tau = torch.zeros_like(q)
     path = [(q, qd)]
     for _ in range(steps):
@@ -50,9 +50,9 @@ RUNS = [
 
 
 def trajectory_error(run: dict[str, Any], seconds: float) -> np.ndarray:
-    """Largest position error at each stored time, integrating with order 8 to 1e-12.
+    """Largest position error at each stored time, integrated with order 8 to 1e-12.
 
-    Point masses whirl so fast that RK4 would need steps of 0.1 ms.
+    Point masses rotate so fast that RK4 would need steps of 0.1 ms.
     """
     dof, interval = run["dof"], run["dt"]
     inertia = {"full": FULL_TENSOR}.get(run["case"], run["case"])
@@ -73,15 +73,15 @@ def trajectory_error(run: dict[str, Any], seconds: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_trajectories_at_first(reference_dir: Path, name: str) -> None:
+def test_short_trajectories_match_the_reference(reference_dir: Path, name: str) -> None:
     data = json.loads((reference_dir / "plant_trajectories.json").read_text())
-    # The solver's own tolerance, grown by chaos over a fraction of a second.
+    # The solver's own tolerance, amplified by chaos over a fraction of a second.
     assert trajectory_error(data["trajectories"][name], 0.4).max() < 1e-10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_trajectories(reference_dir: Path, name: str) -> None:
+def test_trajectories_match_the_reference(reference_dir: Path, name: str) -> None:
     data = json.loads((reference_dir / "plant_trajectories.json").read_text())
     run = data["trajectories"][name]
     error = trajectory_error(run, 5.0)
@@ -101,7 +101,7 @@ def test_energy_is_constant_and_rk4_has_order_four(arm: str) -> None:
         total = kinetic + potential
         drifts.append((total - total[0]).abs().max().item())
         ends.append(q[-1])
-    # Error falls 16-fold per halving; differences of neighbours show it without an exact solution.
+    # Error falls 16-fold per halving; successive differences show it without an exact solution.
     ratio = ((ends[0] - ends[1]).norm() / (ends[1] - ends[2]).norm()).item()
     assert 3.6 < math.log2(ratio) < 4.6
     assert drifts[-1] < 1e-7 < kinetic.max()
@@ -119,7 +119,7 @@ def test_single_pendulum_swings_at_its_small_amplitude_frequency() -> None:
     assert ((q[:, 0] - math.pi) / amplitude - time.cos()).abs().max() < 1e-6
 
 
-def test_drag_takes_energy_away() -> None:
+def test_drag_reduces_energy() -> None:
     rig = rigs.multiarm_double()
     k = torch.tensor([0.01, 0.02], dtype=torch.float64)
     q0, qd0 = torch.tensor([2.0, 0.5]).double(), torch.tensor([1.0, -4.0]).double()

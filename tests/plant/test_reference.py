@@ -1,4 +1,4 @@
-"""The chain against exact states of the paper's rig, and against MuJoCo."""
+"""The chain compared with exact states of the paper's rig, and with MuJoCo."""
 
 import json
 import math
@@ -36,7 +36,7 @@ def assert_rounding(got: Tensor, expected: Tensor) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("arm", ["fixed", "free"])
-def test_states(case: str, arm: str, reference_dir: Path) -> None:
+def test_dynamics_match_the_exact_states(case: str, arm: str, reference_dir: Path) -> None:
     data = json.loads((reference_dir / "plant_states.json").read_text())
     states = data["states"][case]
     rig = paper_rig(case, arm, data["meta"]["full_tensor"])
@@ -83,7 +83,7 @@ def mjcf(rig: PendulumChain, tensor: list[list[float]], armature: list[float]) -
 
 
 @pytest.mark.parametrize("arm", ["fixed", "free"])
-def test_mujoco_agrees(arm: Any) -> None:
+def test_dynamics_agree_with_mujoco(arm: Any) -> None:
     mujoco = pytest.importorskip("mujoco")
     rig = paper_rig("full", arm)
     armature = [0.01, 0.02, 0.003, 0.0004][-rig.joints :]

@@ -1,4 +1,4 @@
-"""Rigs by name, their published numbers, and rig files."""
+"""Named rigs, their published numbers, and rig files."""
 
 import json
 import math
@@ -19,7 +19,7 @@ def test_every_rig_moves_and_keeps_its_name(name: str) -> None:
     assert rig.name == name
     assert len(rig.joint_names) == rig.joints
     assert rig.position_quantum is not None
-    assert "buffers" not in rig.to_dict()  # its parameters say all
+    assert "buffers" not in rig.to_dict()  # its parameters are complete
     generator = torch.Generator().manual_seed(0)
     state = torch.randn(3, 4, rig.joints, dtype=torch.float64, generator=generator).unbind(0)
     assert rig(*state).isfinite().all()
@@ -29,7 +29,7 @@ def test_every_rig_moves_and_keeps_its_name(name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore:the inertia of link")
 @pytest.mark.parametrize("name", rigs.names())
-def test_rig_files_come_back_as_they_went(name: str, tmp_path: Path) -> None:
+def test_rig_file_round_trip_is_exact(name: str, tmp_path: Path) -> None:
     rig = rigs.by_name(name)
     fitted = rig.replace(torque_offset=rig.torque_offset + 0.125)
     rigs.write(fitted, tmp_path / "rig.json")
@@ -50,7 +50,7 @@ def test_unknown_names_list_the_valid_ones() -> None:
         rigs.tlrip(inertia="some")  # type: ignore[arg-type]
 
 
-def test_conventions_and_quanta() -> None:
+def test_conventions_and_encoder_resolutions_of_named_rigs() -> None:
     assert rigs.tlrip().convention == ("relative", "upright")
     assert rigs.rtip().convention == ("relative", "hanging")
     assert rigs.multiarm_double().convention == ("absolute", "hanging")
@@ -67,7 +67,7 @@ def test_conventions_and_quanta() -> None:
         ("C1", (0.5235, 0.6256), (0.2, 0.2557), 0.2, (0.03189, 0.05087), 6.29e-5),
     ],
 )
-def test_dfki_has_the_sources_mass_matrix(
+def test_dfki_has_the_mass_matrix_of_its_source(
     build: str,
     m: tuple[float, float],
     r: tuple[float, float],
@@ -86,7 +86,7 @@ def test_dfki_has_the_sources_mass_matrix(
         torch.testing.assert_close(rig.mass_matrix(q), expected, rtol=1e-12, atol=1e-14)
 
 
-def test_emps_offset_has_the_recordings_sign(data_dir: Path) -> None:
+def test_emps_offset_has_the_sign_of_the_recording(data_dir: Path) -> None:
     """Regression tau = M qdd + Fv qd + Fc sgn(qd) - torque_offset on the real recording."""
     signal = pytest.importorskip("scipy.signal")
     rows = np.loadtxt(data_dir / "emps" / "emps_first.csv", delimiter=",", skiprows=1)
@@ -123,12 +123,12 @@ def write(path: Path, text: str) -> Path:
         ('{"mass": ', "rig.json"),
     ],
 )
-def test_bad_rig_files_are_explained(text: str, message: str, tmp_path: Path) -> None:
+def test_bad_rig_files_raise_clear_errors(text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         rigs.read(write(tmp_path / "rig.json", text))
 
 
-def test_other_endings(tmp_path: Path) -> None:
+def test_toml_is_read_and_other_suffixes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.json or \.toml"):
         rigs.read(write(tmp_path / "rig.yaml", "mass: 1"))
     with pytest.raises(ValueError, match=r"written as \.json"):
@@ -143,13 +143,13 @@ def test_other_endings(tmp_path: Path) -> None:
     assert rig.name == "bench"
 
 
-def test_a_rig_file_may_hold_drag(tmp_path: Path) -> None:
+def test_rig_file_may_contain_drag(tmp_path: Path) -> None:
     data = {"mass": [1.0], "length": [1.0], "buffers": {"drag_quadratic": [0.1]}}
     rig = rigs.read(write(tmp_path / "rig.json", json.dumps(data)))
     assert rig.has_drag
 
 
-def test_a_mistyped_rig_or_key_gets_the_nearest_one(tmp_path: Path) -> None:
+def test_mistyped_rig_or_key_suggests_the_nearest_one(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Did you mean multiarm-double"):
         rigs.by_name("multiarm_double")
     text = '{"mass": [1], "lenght": [1]}'
@@ -159,7 +159,7 @@ def test_a_mistyped_rig_or_key_gets_the_nearest_one(tmp_path: Path) -> None:
         rigs.read(write(tmp_path / "rig.json", '{"length": [1]}'))
 
 
-HUGE = "1" + "0" * 400  # a whole number in JSON, beyond every float
+HUGE = "1" + "0" * 400  # an integer in JSON, beyond the range of float
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,9 @@ HUGE = "1" + "0" * 400  # a whole number in JSON, beyond every float
         f'{{"kind": "axis", "mass": {HUGE}}}',
     ],
 )
-def test_numbers_beyond_every_float_are_refused_in_short(text: str, tmp_path: Path) -> None:
+def test_numbers_beyond_float_range_are_refused_in_a_short_message(
+    text: str, tmp_path: Path
+) -> None:
     with pytest.raises(ValueError, match=r"rig\.json: .* must be") as refusal:
         rigs.read(write(tmp_path / "rig.json", text))
     assert len(str(refusal.value)) < 400
@@ -198,7 +200,7 @@ def test_python_arguments_are_checked_like_those_of_files(changed: dict, message
         PendulumChain(**({"mass": [1.0], "length": [1.0]} | changed))
 
 
-def test_an_arm_of_no_number_is_refused() -> None:
+def test_arm_length_that_is_no_number_is_refused() -> None:
     for value in (math.inf, math.nan, -1.0, 10**400, "1"):
         with pytest.raises(ValueError, match="`arm's length` must be"):
             Arm(1.0, value)  # type: ignore[arg-type]
@@ -209,7 +211,7 @@ def test_states_that_are_no_tensors_are_refused_by_name() -> None:
         rigs.xl330().load([0.1], [0.0])  # type: ignore[arg-type]
 
 
-def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
+def test_arm_must_be_an_arm_and_is_stored_as_plain_numbers() -> None:
     with pytest.raises(TypeError, match="`arm` must be an Arm"):
         PendulumChain([1.0], [1.0], arm={"inertia": 1.0, "length": 1.0})  # type: ignore[arg-type]
     arm = Arm(torch.tensor(1.0), np.float64(0.5))  # type: ignore[arg-type]
@@ -220,7 +222,7 @@ def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
             rigs.from_dict(wrong)  # type: ignore[arg-type]
 
 
-def test_a_geared_motor_adds_its_reflected_inertia_to_the_arm_alone() -> None:
+def test_geared_motor_adds_its_reflected_inertia_only_to_the_arm() -> None:
     """As in `datasets/rtip_twin`: the RTIP paper's gearbox of 10:1, a hundred times the rotor."""
     plain = rigs.rtip("free")
     free = plain.to_dict()

@@ -1,4 +1,4 @@
-"""One turning axis: the chain's equation in a motor's terms, and rigs with motors."""
+"""One rotating axis: the chain's equation in a motor's parameters, and rigs with motors."""
 
 import json
 import math
@@ -18,7 +18,7 @@ def states() -> tuple[torch.Tensor, ...]:
     return torch.randn(3, 5, 1, dtype=torch.float64).unbind(0)
 
 
-def test_a_pendulum_on_a_geared_motor_follows_newton() -> None:
+def test_pendulum_on_a_geared_motor_follows_newtons_law() -> None:
     rotor = Rotor(0.05, mass=0.5, com=0.3, motor=GEARED)
     q, qd, tau = states()
     qdd = (tau + 0.5 * 9.81 * 0.3 * torch.sin(q)) / (0.05 + 50**2 * 1.2e-5)
@@ -27,7 +27,7 @@ def test_a_pendulum_on_a_geared_motor_follows_newton() -> None:
     assert rotor.motor_factors == {"motor": [0.02], "current": [pytest.approx(1.5)]}
 
 
-def test_a_rotor_is_a_chain_of_one_link() -> None:
+def test_rotor_equals_a_chain_of_one_link() -> None:
     rotor = Rotor(0.05, mass=0.5, com=0.3)
     chain = PendulumChain([0.5], [1.0], [0.3], [0.05 - 0.5 * 0.09])
     for given in (states(), states()):
@@ -35,7 +35,7 @@ def test_a_rotor_is_a_chain_of_one_link() -> None:
 
 
 @pytest.mark.parametrize("rotor", [Rotor(0.02), Rotor(motor=GEARED), Rotor(0.02, motor=GEARED)])
-def test_a_balanced_rotor_has_no_gravity_and_an_even_load(rotor: Rotor) -> None:
+def test_balanced_rotor_has_no_gravity_and_a_constant_load(rotor: Rotor) -> None:
     q, qd, tau = states()
     assert not rotor.gravity(q).any()
     assert torch.equal(rotor.load(q, qd), torch.ones_like(q))
@@ -62,7 +62,7 @@ def test_rig_files_of_every_kind_keep_their_motors(tmp_path) -> None:
             assert torch.equal(value, other)
 
 
-def test_a_rotor_inertia_is_seen_at_the_joint() -> None:
+def test_rotor_inertia_is_reflected_to_the_joint() -> None:
     motor = Motor([6, 50], [1e-5, 1e-6])
     chain = PendulumChain([1.0, 0.5], [0.3, 0.2], motor=motor)
     same = PendulumChain([1.0, 0.5], [0.3, 0.2], armature=[36e-5, 2500e-6])
@@ -96,7 +96,7 @@ def test_impossible_rigs_are_refused(rig: dict, message: str) -> None:
         rigs.from_dict(json.loads(json.dumps(rig)))
 
 
-def test_a_rig_by_name_file_or_itself(tmp_path) -> None:
+def test_rig_may_be_given_by_name_file_or_object(tmp_path) -> None:
     rotor = Rotor(0.02)
     rigs.write(rotor, tmp_path / "rig.json")
     assert rigs.of(rotor) is rotor
@@ -106,7 +106,7 @@ def test_a_rig_by_name_file_or_itself(tmp_path) -> None:
         rigs.of([rotor])  # type: ignore[arg-type]
 
 
-def test_motors_of_several_links_are_no_absolute_angles() -> None:
+def test_motors_of_several_links_refuse_absolute_angles() -> None:
     time = np.arange(200) * 1e-3
     table = pd.DataFrame({"time": time, "motor1": 10 * np.sin(time), "motor2": 20 * np.sin(time)})
 
@@ -122,6 +122,6 @@ def test_motors_of_several_links_are_no_absolute_angles() -> None:
     np.testing.assert_allclose(q, np.stack([np.sin(time), 2 * np.sin(time)], 1))
 
 
-def test_a_motor_of_a_rotor_is_a_motor() -> None:
+def test_motor_of_a_rotor_must_be_a_motor() -> None:
     with pytest.raises(TypeError, match="must be a Motor"):
         Rotor(0.02, motor={"gear_ratio": 5})  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Coefficients in figures are the models' own, and intervals those that the fit claims."""
+"""Figures of coefficients show the models' own values and the intervals of the fit."""
 
 import warnings
 from dataclasses import replace
@@ -22,13 +22,13 @@ def motion() -> Motion:
 
 
 def varying(model: FrictionModel) -> FrictionModel:
-    """The same with other parameters, whose coefficients follow the motion."""
+    """The same with other parameters, whose coefficients depend on the motion."""
     start = model.schedule.parameter_vector()
     model.schedule.set_parameter_vector(start + 0.2 * torch.sin(torch.arange(1.0, len(start) + 1)))
     return model
 
 
-def test_lines_are_the_coefficients_along_the_motion(motion):
+def test_lines_show_the_coefficients_along_the_motion(motion):
     models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": varying(NFLFM(2, [1e-3, 2e-2]))}
     figure = plots.coefficients_over_time(models, motion, joint_names=["a", "b"])
     assert len(figure.axes) == 4
@@ -42,7 +42,7 @@ def test_lines_are_the_coefficients_along_the_motion(motion):
     figure.draw_without_rendering()
 
 
-def test_models_of_one_law_keep_their_colours_among_all(motion):
+def test_models_of_one_law_keep_their_colours_in_every_figure(motion):
     models = {"NCFM": NCFM(2), "LFM": LFM(2), "NFLFM": varying(NFLFM(2))}
     figure = plots.coefficients_over_time(models, motion, law=models["LFM"].law.name)
     looks = plots.style.looks(models)
@@ -52,35 +52,35 @@ def test_models_of_one_law_keep_their_colours_among_all(motion):
     assert lines[1].get_linestyle() == "-"  # a network's, which may be steep
 
 
-def test_constant_coefficients_are_told_and_not_drawn(motion):
+def test_constant_coefficients_are_printed_instead_of_drawn(motion):
     model = NFCVFM(2, [[8e-3, 2e-3], [5e-3, 0.3]], inputs=["heat"])
     model.schedule.set_heat([2e-3, 4e-3], 60.0, 5e-3)
     figure = plots.coefficients_over_time({"NFCVFM": model}, motion)
     first, second = figure.axes
     assert first.get_ylabel() == "$h$ [-]"
-    told = "constant:\n$F_\\mathrm{c}$ = %s\n$F_\\mathrm{v}$ = %s\n$k_\\mathrm{h}$ = 0"
-    assert first.get_title() == "joint1\n" + told % ("8 mN m", "2 mN m s/rad")
-    assert second.get_title() == "joint2\n" + told % ("5 mN m", "0.3 N m s/rad")
+    constants = "constant:\n$F_\\mathrm{c}$ = %s\n$F_\\mathrm{v}$ = %s\n$k_\\mathrm{h}$ = 0"
+    assert first.get_title() == "joint1\n" + constants % ("8 mN m", "2 mN m s/rad")
+    assert second.get_title() == "joint2\n" + constants % ("5 mN m", "0.3 N m s/rad")
     figure.draw_without_rendering()
 
 
-def test_a_figure_of_constants_alone_has_only_their_values(motion):
+def test_figure_of_constants_only_shows_their_values(motion):
     models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": NFLFM(2, [1e-3, 1e-2])}
     figure = plots.coefficients_over_time(models, motion)
     assert not any(ax.lines or ax.axison for ax in figure.axes)
-    told = "constant:\n$B$ = 2 / 1 mN m s/rad\n$C$ = 10 mN m"
-    assert [ax.get_title() for ax in figure.axes] == [f"joint{k}\n{told}" for k in (1, 2)]
+    constants = "constant:\n$B$ = 2 / 1 mN m s/rad\n$C$ = 10 mN m"
+    assert [ax.get_title() for ax in figure.axes] == [f"joint{k}\n{constants}" for k in (1, 2)]
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # such as of a layout without room for its text
         figure.draw_without_rendering()
         plots.coefficients_over_time({"NCFM": NCFM(2)}, motion).draw_without_rendering()
 
 
-def test_an_adaptive_model_switches_as_a_controller_does(motion):
+def test_adaptive_model_switches_as_in_a_controller(motion):
     values = [[1e-3, 1e-2], [2e-3, 2e-2], [3e-3, 3e-2]]
     model = ALFM(2, [values, values])
     qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
-    model.schedule.thresholds[:] = torch.tensor([2.0, 6.0])  # the motion begins with none
+    model.schedule.thresholds[:] = torch.tensor([2.0, 6.0])  # the motion begins without any
     figure = plots.coefficients_over_time({"ALFM": model}, motion)
     memory, expected = model.schedule.initial_state(qd[0], qdd[0]), []
     for k, (v, a) in enumerate(zip(qd, qdd, strict=True)):
@@ -98,8 +98,8 @@ def test_intervals_are_those_of_the_fit():
     found = fit(NCFM(1), plant, recording, method="equation_error")
     value = float(found.model.schedule.values)
     (joint,) = plant.joint_names
-    told = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
-    figure = plots.coefficient_intervals({"known": replace(found, intervals=(told,)),
+    interval = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
+    figure = plots.coefficient_intervals({"known": replace(found, intervals=(interval,)),
                                           "unknown": replace(found, intervals=())})  # fmt: skip
     (ax,) = figure.axes
     (low, high), (edge, other) = (
@@ -110,7 +110,7 @@ def test_intervals_are_those_of_the_fit():
     figure.draw_without_rendering()
 
 
-def test_what_cannot_be_compared_is_refused(motion):
+def test_models_that_cannot_be_compared_are_refused(motion):
     with pytest.raises(ValueError, match="one law"):
         plots.coefficients_over_time({"LFM": LFM(2), "NCFM": NCFM(2)}, motion)
     with pytest.raises(ValueError, match="one law"):

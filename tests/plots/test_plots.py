@@ -1,4 +1,4 @@
-"""Figures show the very numbers given, with units, and no text that overlaps or is cut off."""
+"""Figures show the given numbers with units, and no text overlaps or is cut off."""
 
 import itertools
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def swing(joints: int, unit: str = "rad", name: str = "swing") -> Recording:
 def score_of(
     recording: Recording, error: float, *, lost: bool = False, limited: bool = True
 ) -> Score:
-    """A score whose free run is off by a growing error; a lost one ends in NaN at 1 s."""
+    """A score whose free-run error grows; a diverged one ends in NaN at 1 s."""
     simulated = recording.q + error * np.linspace(0.0, 1.0, len(recording))[:, None]
     if lost:
         simulated[50:] = np.nan
@@ -72,11 +72,11 @@ def comparison_of(recording: Recording, *, part: str = "test", **options) -> Com
 
 
 def assert_tidy(figure: Figure) -> None:
-    """No axis with its labels, title or legend runs into another's, or over the edge."""
+    """Assert that axes with labels, titles and legends neither overlap nor exceed the figure."""
     figure.draw_without_rendering()
     boxes = [(ax, box) for ax in figure.axes if ax.get_visible() for box in parts(ax)]
     boxes += [(text, text.get_window_extent()) for text in (*figure.texts, *figure.legends)]
-    # A pixel of slack; parts of one panel may touch.
+    # One pixel of tolerance; parts of one panel may touch.
     boxes = [(owner, box.padded(-1.0)) for owner, box in boxes]
     for _, box in boxes:
         assert box.x0 >= 0
@@ -100,7 +100,7 @@ def texts(ax: Axes) -> list[str]:
 @pytest.mark.parametrize(
     ("joints", "unit", "lost"), [(1, "rad", ()), (4, "rad", ("NCFM",)), (1, "m", NAMES)]
 )
-def test_positions_show_the_measurement_the_simulations_and_their_difference(joints, unit, lost):
+def test_positions_show_measurement_simulations_and_errors(joints, unit, lost):
     recording = swing(joints, unit)
     scores = scores_of(recording, lost=lost)
     figure = plots.positions(recording, scores)
@@ -112,7 +112,7 @@ def test_positions_show_the_measurement_the_simulations_and_their_difference(joi
         np.testing.assert_array_equal(measured, recording.q[:, j])
         for shown, score in zip(simulated, scores.values(), strict=True):
             np.testing.assert_array_equal(shown, score.simulated[:, j])
-        # Without friction, the error would leave the panel at every swing.
+        # Without friction, the error would leave the panel in every swing.
         drawn = [score for name, score in scores.items() if name != NO_FRICTION]
         for error, score in zip(below.lines, drawn, strict=True):
             expected = score.simulated[:, j] - recording.q[:, j]
@@ -122,7 +122,7 @@ def test_positions_show_the_measurement_the_simulations_and_their_difference(joi
     assert_tidy(figure)
 
 
-def test_a_motion_shows_the_joints_asked_for_within_the_measured_range():
+def test_motion_shows_the_requested_joints_in_the_measured_range():
     recording = swing(3)
     scores = {"no friction": score_of(recording, 1e3), "LFM": score_of(recording, 1e-3)}
     figure = plots.motion(recording, scores, joints=[2, 0])
@@ -139,12 +139,12 @@ def test_a_motion_shows_the_joints_asked_for_within_the_measured_range():
         plots.motion(swing(2), scores)
 
 
-def test_a_comparison_draws_its_errors_by_length():
+def test_comparison_draws_its_errors_by_horizon():
     figure = comparison_of(swing(1)).plot()
     assert figure.axes[0].get_xlabel() == "length of simulation"
 
 
-def test_an_error_that_diverged_does_not_set_the_scale():
+def test_diverged_error_does_not_set_the_scale():
     recording = swing(1)
     scores = scores_of(recording) | {"LFM": score_of(recording, 1e9, lost=True)}
     assert max(plots.positions(recording, scores).axes[1].get_ylim()) < 200  # mrad
@@ -159,7 +159,7 @@ def test_positions_of_another_recording_are_refused():
 
 @pytest.mark.parametrize("unit", ["rad", "m"])
 @pytest.mark.parametrize("spread", [2.0, 100.0])
-def test_bars_are_as_high_as_the_errors(unit, spread):
+def test_heights_of_bars_equal_the_errors(unit, spread):
     table = pd.DataFrame(
         [[1e-3, 2e-3], [1e-3 * spread, np.inf]], index=["LFM", "NCFM"], columns=["joint1", "all"]
     )
@@ -174,7 +174,7 @@ def test_bars_are_as_high_as_the_errors(unit, spread):
     assert_tidy(figure)
 
 
-def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
+def test_bars_show_all_models_of_four_joints_and_diverged_runs():
     columns = ["arm", "joint2", "joint3", "joint4", "all"]
     many = pd.DataFrame(0.02, index=[NO_FRICTION, *model_names()], columns=columns)
     assert_tidy(plots.rmse_bars(many, "rad"))
@@ -186,7 +186,7 @@ def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
 
 @pytest.mark.parametrize("part", ["test", "train"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
-def test_horizon_curve_is_the_table_of_each_horizon_over_the_limit(part, unit):
+def test_horizon_curve_shows_each_horizon_relative_to_the_limit(part, unit):
     comparison = comparison_of(swing(2, unit), part=part)
     figure = plots.horizon_curve(comparison)
     ax = figure.axes[0]
@@ -201,7 +201,7 @@ def test_horizon_curve_is_the_table_of_each_horizon_over_the_limit(part, unit):
     assert_tidy(figure)
 
 
-def test_horizon_curve_names_what_diverged_and_draws_no_limit_where_none_is_known():
+def test_horizon_curve_names_diverged_runs_and_omits_an_unknown_limit():
     figure = plots.horizon_curve(comparison_of(swing(1), lost=("NCFM",), limited=False))
     ax = figure.axes[0]
     assert set(texts(ax)) == {"diverged"}
@@ -210,7 +210,7 @@ def test_horizon_curve_names_what_diverged_and_draws_no_limit_where_none_is_know
 
 
 def axis_data(law: NCFM | LFM | NLFM, mass: float = 2.0) -> tuple[LinearAxis, Recording, Motion]:
-    """A carriage whose force is that of its motion and of a friction law, exactly."""
+    """A carriage whose force is exactly that of its motion and of a friction law."""
     time = np.linspace(0.0, 3.0, 1501)
     sine, cosine = (f(4 * time)[:, None] for f in (np.sin, np.cos))
     q, qd, qdd = 0.2 * sine, 0.8 * cosine, -3.2 * sine
@@ -221,7 +221,7 @@ def axis_data(law: NCFM | LFM | NLFM, mass: float = 2.0) -> tuple[LinearAxis, Re
     return LinearAxis(mass), recording, Motion(time, q, qd, qdd)
 
 
-def test_torque_of_the_motion_lies_on_the_law_that_made_it():
+def test_torque_points_lie_on_the_true_law():
     law = LFM(1, [3.0, 5.0])
     plant, recording, motion = axis_data(law)
     figure = plots.torque_over_velocity(plant, {"LFM": law}, [recording], [motion])
@@ -232,12 +232,12 @@ def test_torque_of_the_motion_lies_on_the_law_that_made_it():
     expected = law(velocity, 0 * velocity, torch.ones_like(velocity)).detach()[:, 0]
     np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-12)
     x, y = dots.get_data()
-    clear = np.abs(x) > 0.05  # away from the sign's passage, inside which a line has corners
+    clear = np.abs(x) > 0.05  # away from the sign's transition, in which a line has corners
     np.testing.assert_allclose(y[clear], np.interp(x, *line.get_data())[clear], rtol=1e-3)
     assert_tidy(figure)
 
 
-def test_medians_show_the_friction_where_noise_hides_it():
+def test_medians_show_the_friction_despite_noise():
     law = CVFM(1, [3.0, 5.0])
     plant, recording, motion = axis_data(law)
     noise = np.random.default_rng(1).normal(0, 30.0, recording.tau.shape)
@@ -249,7 +249,7 @@ def test_medians_show_the_friction_where_noise_hides_it():
     assert np.ptp(ax.get_ylim()) < np.ptp(ax.lines[0].get_ydata())
 
 
-def test_the_band_around_a_law_holds_what_its_parameters_leave_open():
+def test_band_around_a_law_shows_its_parameter_uncertainty():
     law = CVFM(1, [3.0, 5.0])
     plant, recording, motion = axis_data(law)
     # Deviations of 0.1 N and 0.2 N s/m, independent of each other.
@@ -267,7 +267,7 @@ def test_the_band_around_a_law_holds_what_its_parameters_leave_open():
     assert_tidy(figure)
 
 
-def test_every_joint_has_its_panel_of_torques():
+def test_every_joint_has_a_torque_panel():
     plant = rigs.multiarm_triple()
     recording = swing(3)
     models = {"NCFM": NCFM(3), "NFLFM": NFLFM(3)}
@@ -278,7 +278,7 @@ def test_every_joint_has_its_panel_of_torques():
 
 
 @pytest.mark.parametrize(("joints", "unit"), [(1, "m"), (4, "rad")])
-def test_coefficient_maps_show_the_schedule_where_there_are_data(joints, unit):
+def test_coefficient_maps_show_the_schedule_inside_the_data(joints, unit):
     model = NFLFM(joints)
     start = model.schedule.parameter_vector()
     noise = torch.randn(len(start), generator=torch.Generator().manual_seed(1), dtype=start.dtype)
@@ -346,18 +346,18 @@ def test_only_neuro_fuzzy_models_have_sets_and_maps():
 
 
 @given(st.floats(1e-6, 1e6), st.sampled_from(["rad", "m", "N m s/rad"]))
-def test_a_prefix_says_the_factor(size, unit):
+def test_unit_prefix_matches_the_factor(size, unit):
     factor, label = style.scaled(unit, [size, np.inf, np.nan])
     assert label.removesuffix(unit) == {1.0: "", 1e3: "m", 1e6: "µ"}[factor]
     assert factor == 1.0 or 0.2 <= factor * size <= 200.0 * (1 + 1e-12) or size < 2e-4
 
 
 def rc_params() -> dict:
-    # Reading the backend would itself choose one.
+    # Reading the backend would itself select one.
     return {key: mpl.rcParams[key] for key in mpl.rcParams if key != "backend"}
 
 
-def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monkeypatch):
+def test_save_all_writes_every_figure_and_keeps_matplotlib_settings(tmp_path, monkeypatch):
     monkeypatch.setattr(of_comparisons, "DPI", 40)
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
     unseen = swing(1, "m", name="unseen")
@@ -383,12 +383,12 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monk
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
     assert (tmp_path / "figures" / "rmse_test.png").is_file()
-    # A network whose coefficients are constants, as of one that was rejected, has nothing to show.
+    # A network with constant coefficients, like a rejected one, has nothing to show.
     rejected = replace(comparison, fits=fits | {"NFNCFM": replace(found, model=NFNCFM(1))})
     names = {f.name for f in plots.save_all(rejected, [recording], tmp_path / "fewer")}
     assert "torque_over_velocity.png" in names
     assert not any("NFNCFM" in name or "over_time" in name for name in names)
-    law = replace(comparison, fits={}, test={})  # read from a file: scores alone
+    law = replace(comparison, fits={}, test={})  # read from a file: scores only
     paper = plots.save_all(law, [], tmp_path / "paper", formats=("svg", "pdf"))
     assert {f.suffix for f in paper} == {".png", ".svg", ".pdf"}
     assert (tmp_path / "paper" / "rmse_train.pdf").read_bytes().startswith(b"%PDF")
@@ -397,7 +397,7 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monk
         plots.save_all(comparison, [swing(1, "m", name="other")], tmp_path)
 
 
-def test_drawn_mass_centres_bear_the_weight_that_the_plant_feels():
+def test_drawn_mass_centres_give_the_gravity_of_the_plant():
     plant = rigs.tlrip(arm="free")
     figure = plots.mechanism(plant)
     _, along, _ = figure.axes
@@ -423,7 +423,7 @@ def test_every_kind_of_rig_is_drawn_with_its_data(plant):
     assert_tidy(figure)
 
 
-def test_an_animation_has_a_frame_each_40_ms_and_ends_where_asked(tmp_path):
+def test_animation_has_a_frame_every_40_ms_and_the_requested_end(tmp_path):
     time = np.arange(200) * 0.01
     q = np.sin(3 * time)[:, None] * [0.5, -0.3]
     lost = np.where(time[:, None] > 1.0, np.nan, q)
@@ -435,7 +435,7 @@ def test_an_animation_has_a_frame_each_40_ms_and_ends_where_asked(tmp_path):
         assert (gif.n_frames, gif.info["duration"]) == (10, 40)
 
 
-def test_all_models_are_told_apart_by_marker_and_by_dashes():
+def test_models_are_distinguished_by_marker_and_dashes():
     looks = [style.looks(model_names())[name] for name in model_names()]
     assert len({(look.line["color"], look.marker["marker"]) for look in looks}) == len(
         model_names()
@@ -445,17 +445,17 @@ def test_all_models_are_told_apart_by_marker_and_by_dashes():
     )
 
 
-def test_dashes_hide_no_equal_curve_in_whatever_order():
+def test_dashes_leave_equal_curves_visible_in_any_order():
     looks = style.looks(["CVFM", "NFCVFM", "LFM", "NFLFM", "NLFM", "NFNLFM"])
     whole = [x.line["zorder"] for x in looks.values() if x.line["linestyle"] == "-"]
     assert len(whole) == 2
     dashed = [look.line["zorder"] for name, look in looks.items() if name in ("NFCVFM", "NFNLFM")]
     assert max(whole) < min(dashed)
-    # It fades away behind all models.
+    # It is behind all models and fades out.
     assert looks["no friction"].line["zorder"] < min(dashed)
 
 
-def test_a_motor_is_drawn_with_its_data_in_no_frame():
+def test_motor_is_drawn_with_its_data_and_without_a_frame():
     figure = plots.mechanism(Rotor(0.02, motor=Motor(50, 1.2e-5, 0.03), name="wheel"))
     wheel, words = figure.axes
     assert not wheel.axison
@@ -464,7 +464,7 @@ def test_a_motor_is_drawn_with_its_data_in_no_frame():
         assert line in text.get_text()
 
 
-def test_legends_name_models_as_papers_and_in_plain_words():
+def test_legends_show_paper_names_and_plain_names():
     figure = comparison_of(swing(1)).plot()
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert {"no friction", "viscous (NCFM)", "neuro-fuzzy:load-coulomb (NFLFM)"} < set(labels)

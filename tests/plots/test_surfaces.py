@@ -1,4 +1,4 @@
-"""Maps and sections show what the fit leaves open, and tell where nothing was seen."""
+"""Maps and sections show the uncertainty of a fit, and fade outside the data."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ F64 = torch.float64
 
 @pytest.fixture
 def known():
-    """A model of two joints whose parameters are known to a random covariance."""
+    """A model of two joints whose parameters have a random covariance."""
     torch.manual_seed(0)
     model = NFLFM(2, [2e-3, 1e-2])
     root = 0.02 * torch.randn(len(model.schedule.parameter_vector()), 6, dtype=F64)
@@ -22,7 +22,7 @@ def known():
 
 
 def slow_motion() -> Motion:
-    """Both joints up to 3 rad/s only, a seventh of the range, without acceleration."""
+    """Both joints up to only 3 rad/s, a seventh of the range, without acceleration."""
     qd = np.linspace(0.0, 3.0, 400)[:, None].repeat(2, 1)
     return Motion(qd[:, 0], qd, qd, 0 * qd)
 
@@ -33,7 +33,7 @@ def mesh_of(ax) -> QuadMesh:
 
 
 @pytest.mark.slow
-def test_maps_fade_as_they_become_uncertain(known):
+def test_maps_fade_with_uncertainty(known):
     model, uncertainty = known
     figure = plots.coefficient_surfaces(model, uncertainty=uncertainty)
     maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
@@ -50,7 +50,7 @@ def test_maps_fade_as_they_become_uncertain(known):
     assert (mesh_of(plain.axes[0]).get_alpha() == 1.0).all()
 
 
-def test_what_is_wholly_unknown_can_be_drawn(known):
+def test_unknown_coefficients_can_be_drawn(known):
     model, uncertainty = known
     lost = CoefficientUncertainty(model.schedule, torch.full_like(uncertainty.root, torch.inf))
     for draw in (plots.coefficient_surfaces, plots.coefficient_sections):
@@ -63,7 +63,7 @@ def test_what_is_wholly_unknown_can_be_drawn(known):
         assert all(np.max(alpha) < 0.5 for alpha in shown)
 
 
-def test_sections_are_the_coefficients_with_their_intervals(known):
+def test_sections_show_the_coefficients_with_their_intervals(known):
     model, uncertainty = known
     figure = plots.coefficient_sections(model, uncertainty=uncertainty, joint_names=["a", "b"])
     for j, k in np.ndindex(2, 2):
@@ -87,7 +87,7 @@ def test_sections_are_the_coefficients_with_their_intervals(known):
     figure.draw_without_rendering()
 
 
-def test_sections_are_faint_where_nothing_was_seen(known):
+def test_sections_are_faint_outside_the_data(known):
     model, _ = known
     ax = plots.coefficient_sections(model, [slow_motion()]).axes[0]
     steady = [line for line in ax.lines if line.get_color() == ax.lines[2].get_color()]
@@ -104,12 +104,12 @@ def test_only_neuro_fuzzy_models_have_sections():
 
 
 @pytest.mark.parametrize("draw", [plots.coefficient_surfaces, plots.coefficient_sections])
-def test_a_coefficient_that_is_not_fitted_is_not_drawn(draw):
+def test_fixed_coefficient_is_not_drawn(draw):
     """It is the same everywhere: the exponent of the Stribeck law."""
     model = NFStribeck(1, terms=(2, 2), head_units=2)
     model.schedule.set_range(5.0, [-100.0, 100.0])
     figure = draw(model)
-    said = [f"{ax.get_ylabel()} {ax.get_title()}" for ax in figure.axes]
-    symbols = {word for text in said for word in text.split() if word.startswith("$")}
+    labels = [f"{ax.get_ylabel()} {ax.get_title()}" for ax in figure.axes]
+    symbols = {word for text in labels for word in text.split() if word.startswith("$")}
     assert len(symbols) == 4
     assert not any("delta" in symbol for symbol in symbols)

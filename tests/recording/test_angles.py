@@ -1,4 +1,4 @@
-"""Angle conventions: exact round trips, geometry as the witness, clear errors."""
+"""Angle conventions: exact round trips, consistent geometry, clear errors."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ positions = arrays(np.float64, (5, 4), elements=st.floats(-50, 50))
 
 
 @given(q=positions, convention=st.sampled_from(CONVENTIONS), first_link=st.sampled_from([0, 1]))
-def test_conversions_undo_each_other(
+def test_conversions_are_inverse(
     q: np.ndarray, convention: AngleConvention, first_link: int
 ) -> None:
     # Four additions of numbers below 200: a few of their rounding errors.
@@ -38,7 +38,9 @@ def test_default_convention_changes_nothing(q: np.ndarray) -> None:
 
 
 @given(q=positions, convention=st.sampled_from(CONVENTIONS))
-def test_columns_before_the_first_link_stay(q: np.ndarray, convention: AngleConvention) -> None:
+def test_columns_before_the_first_link_are_unchanged(
+    q: np.ndarray, convention: AngleConvention
+) -> None:
     assert np.array_equal(convention.position_to_joint(q, 1)[:, 0], q[:, 0])
     assert np.array_equal(
         convention.position_to_joint(q, 1)[:, 1:], convention.position_to_joint(q[:, 1:])
@@ -47,7 +49,7 @@ def test_columns_before_the_first_link_stay(q: np.ndarray, convention: AngleConv
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
 def test_every_convention_describes_the_same_mechanism(convention: AngleConvention) -> None:
-    """Tip of a chain of unit links, from the definition of each convention and from joints."""
+    """Tip of a chain of unit links, from each convention's definition and from joint angles."""
     written = np.random.default_rng(1).uniform(-3, 3, (20, 3))
     absolute = np.cumsum(written, axis=1) if convention.angles == "relative" else written
     up = -1.0 if convention.measured_from == "hanging" else 1.0
@@ -68,7 +70,7 @@ def test_rates_are_the_derivative_of_positions() -> None:
         np.testing.assert_allclose(convention.rate_to_joint(qd), difference, atol=2e-9)
 
 
-def test_the_argument_is_not_changed() -> None:
+def test_argument_is_not_modified() -> None:
     q = np.ones((2, 3))
     AngleConvention("absolute", "hanging").position_to_joint(q)
     AngleConvention("absolute", "hanging").position_from_joint(q)
@@ -76,13 +78,13 @@ def test_the_argument_is_not_changed() -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
-def test_text_round_trip(convention: AngleConvention) -> None:
+def test_text_round_trip_is_exact(convention: AngleConvention) -> None:
     assert AngleConvention.of(str(convention)) == convention
     swapped = f" {convention.measured_from}-{convention.angles.upper()} "
     assert AngleConvention.of(swapped) == convention
 
 
-def test_words_left_out_take_the_default() -> None:
+def test_omitted_words_have_defaults() -> None:
     assert AngleConvention.of("hanging") == AngleConvention("relative", "hanging")
     assert AngleConvention.of("absolute") == AngleConvention("absolute", "upright")
 
@@ -101,17 +103,17 @@ def test_bad_fields_are_refused() -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
-def test_whatever_says_a_convention_is_understood(convention: AngleConvention) -> None:
+def test_every_form_of_a_convention_is_accepted(convention: AngleConvention) -> None:
     class Plant:
         first_link = 0
 
     plant = Plant()
     plant.convention = (convention.angles, convention.measured_from)  # type: ignore[attr-defined]
-    for said in (convention, str(convention), str(convention).split(","), plant):
-        assert AngleConvention.of(said) == convention  # type: ignore[arg-type]
+    for form in (convention, str(convention), str(convention).split(","), plant):
+        assert AngleConvention.of(form) == convention  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("given", [None, 3, "", (), [1, 2], {"absolute": "hanging"}, b"absolute"])
-def test_what_says_no_convention_is_refused(given: object) -> None:
+def test_objects_without_a_convention_are_refused(given: object) -> None:
     with pytest.raises(ValueError, match="`convention` must be one of"):
         AngleConvention.of(given)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Recordings: round trips through every format, windows, validation, the real files."""
+"""Recordings: round trips through every format, slices, validation, the real files."""
 
 import gzip
 import io
@@ -23,7 +23,7 @@ ENDINGS = [".csv", ".csv.gz", ".parquet", ".npz"]
 
 @dataclass
 class Rig:
-    """As much of a plant as a recording asks for."""
+    """The part of a plant that a recording needs."""
 
     convention: tuple[str, str]
     first_link: int
@@ -43,7 +43,7 @@ def swing(n: int = 60, joints: int = 2, **settings: object) -> Recording:
 
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("joints", [1, 3, 11])
-def test_what_is_written_reads_back_equal(tmp_path: Path, ending: str, joints: int) -> None:
+def test_file_round_trip_is_exact(tmp_path: Path, ending: str, joints: int) -> None:
     recording = swing(
         joints=joints,
         convention=AngleConvention("absolute", "hanging"),
@@ -57,7 +57,7 @@ def test_what_is_written_reads_back_equal(tmp_path: Path, ending: str, joints: i
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_optional_columns_and_unit_survive(tmp_path: Path, ending: str) -> None:
+def test_optional_columns_and_unit_are_kept(tmp_path: Path, ending: str) -> None:
     full = swing()
     axis = Recording(full.time, full.q, tau=full.tau, unit="m")
     axis.write(tmp_path / f"axis{ending}")
@@ -67,7 +67,7 @@ def test_optional_columns_and_unit_survive(tmp_path: Path, ending: str) -> None:
     assert back.digest() == axis.digest()
 
 
-def test_pandas_round_trip() -> None:
+def test_pandas_round_trip_is_exact() -> None:
     recording = swing(convention=AngleConvention("absolute"))
     assert Recording.from_pandas(recording.to_pandas()).digest() == recording.digest()
     with pytest.raises(TypeError, match=r"`table` must be a pandas\.DataFrame, got dict"):
@@ -80,7 +80,7 @@ def test_arguments_override_the_file(tmp_path: Path) -> None:
     assert (back.convention, back.unit, back.name) == (AngleConvention(), "m", "a")
 
 
-def test_degrees_are_converted_at_the_border() -> None:
+def test_degrees_are_converted_on_entry() -> None:
     recording = swing()
     table = recording.to_pandas()
     for column in ("q1", "q2", "qd1", "qd2"):
@@ -95,7 +95,7 @@ def test_degrees_are_converted_at_the_border() -> None:
         Recording.from_pandas(table, degrees=True, unit="m")
 
 
-def test_columns_map_names_and_swap_and_shift() -> None:
+def test_columns_option_maps_swaps_and_shifts_names() -> None:
     recording = swing()
     table = recording.to_pandas().rename(columns={"time": "t", "q1": "enc_1"})
     back = Recording.from_pandas(table, columns={"time": "t", "q1": "enc_1"})
@@ -107,7 +107,7 @@ def test_columns_map_names_and_swap_and_shift() -> None:
     assert np.array_equal(renumbered.q, recording.q)
 
 
-def test_extra_columns_are_ignored_and_a_partial_velocity_left_out() -> None:
+def test_extra_columns_and_partial_velocities_are_ignored() -> None:
     recording = swing()
     table = recording.to_pandas().drop(columns=["qd1"])
     table["remark"] = "fine"
@@ -119,17 +119,17 @@ def test_extra_columns_are_ignored_and_a_partial_velocity_left_out() -> None:
 
 
 @pytest.mark.parametrize("columns", [{}, {"tau2": "tau2"}])
-def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
+def test_joint_without_torque_column_is_undriven_with_a_warning(
     tmp_path: Path, columns: dict[str, str]
 ) -> None:
-    """As of an acrobot, whose one motor is between its links."""
+    """As for an acrobot, whose only motor is between its links."""
     recording = swing()
     table = recording.to_pandas().drop(columns=["tau1"])
-    said = r"'run': no column tau1, .* to be passive.*columns=\{\"tau1\": \"\.\.\.\"\}"
-    with pytest.warns(RecordingWarning, match=said):
+    message = r"'run': no column tau1, .* to be passive.*columns=\{\"tau1\": \"\.\.\.\"\}"
+    with pytest.warns(RecordingWarning, match=message):
         back = Recording.from_pandas(table, columns=columns, name="run")
     table.to_csv(tmp_path / "run.csv", index=False)
-    with pytest.warns(RecordingWarning, match=said):
+    with pytest.warns(RecordingWarning, match=message):
         read = Recording.read(tmp_path / "run.csv", columns=columns)
     assert recording.tau is not None
     for found in (back, read):
@@ -138,7 +138,7 @@ def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
         assert np.array_equal(found.tau[:, 1], recording.tau[:, 1])
 
 
-def test_a_unit_in_the_name_of_a_column_holds_in_every_table() -> None:
+def test_unit_in_a_column_name_applies_in_every_table() -> None:
     recording = swing(joints=1)
     names = {"time": "t [ms]", "q1": "angle [deg]", "tau1": "torque_Ncm", "qd1": "speed (deg/s)"}
     table = recording.to_pandas() * {
@@ -161,34 +161,34 @@ def test_a_unit_in_the_name_of_a_column_holds_in_every_table() -> None:
         ("tau1_Ncm", 1, "tau1"), ("torque_2_Nm", 2, "tau2"),
     ],
 )  # fmt: skip
-def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
+def test_ignored_column_that_looks_like_torque_raises_a_warning(
     name: str, joints: int, own: str
 ) -> None:
     table = swing(joints=joints).to_pandas().filter(regex="time|q")
     table[name] = 1.0
-    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as said:
+    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as caught:
         assert Recording.from_pandas(table).tau is None
-    assert len(said) == 1
-    assert f'columns={{"{own}": "{name}"}}' in str(said[0].message)
+    assert len(caught) == 1
+    assert f'columns={{"{own}": "{name}"}}' in str(caught[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Who has named all torques knows what else there is.
+        # If all torques are named, the other columns are ignored on purpose.
         named = {f"tau{k + 1}": f"motor {k}" if k else name for k in range(joints)}
         Recording.from_pandas(table.assign(**{"motor 1": 2.0}), columns=named)
         Recording.from_pandas(table.rename(columns={name: "torque_on"}))
 
 
 @pytest.mark.parametrize("name", ["current", "current1 [A]", "Motorstrom_1"])
-def test_a_current_is_no_torque_and_not_left_out_without_a_word(name: str) -> None:
+def test_ignored_motor_current_raises_a_warning(name: str) -> None:
     table = swing(joints=1).to_pandas().filter(regex="time|q")
     table[name] = 1.0
-    said = "looks like motor current and is not read; .* give the rig a `motor` with its `torque_"
-    with pytest.warns(RecordingWarning, match=said):
+    match = "looks like motor current and is not read; .* give the rig a `motor` with its `torque_"
+    with pytest.warns(RecordingWarning, match=match):
         assert Recording.from_pandas(table).tau is None
 
 
 @pytest.mark.parametrize(("unit", "kind"), [("mA", "motor current"), ("Nm", "torque")])
-def test_a_unit_shows_what_drives_a_joint(tmp_path: Path, unit: str, kind: str) -> None:
+def test_unit_distinguishes_torque_from_current(tmp_path: Path, unit: str, kind: str) -> None:
     rows = "".join(f"{k / 100};{k % 3 / 9};1\n" for k in range(20))
     (tmp_path / "log.csv").write_text(f"time;q1;X\ns;rad;{unit}\n{rows}")
     with pytest.warns(RecordingWarning, match=f"column X looks like {kind} and is not read"):
@@ -196,7 +196,7 @@ def test_a_unit_shows_what_drives_a_joint(tmp_path: Path, unit: str, kind: str) 
 
 
 @pytest.mark.parametrize("columns", [{"q1": "q2"}, {"q1": "q1", "tau2": "q1"}, {"time": "q1:ms"}])
-def test_a_column_is_named_once(columns: dict[str, str]) -> None:
+def test_column_may_be_used_only_once(columns: dict[str, str]) -> None:
     table = swing().to_pandas().drop(columns="tau2", errors="ignore")
     columns = {"q1": "q1", "q2": "q2"} | columns
     with pytest.raises(
@@ -205,7 +205,7 @@ def test_a_column_is_named_once(columns: dict[str, str]) -> None:
         Recording.from_pandas(table, columns=columns)
 
 
-def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
+def test_named_columns_and_joints_must_exist() -> None:
     table = swing().to_pandas()
     with pytest.raises(ValueError, match="column motor is missing; found time"):
         Recording.from_pandas(table, columns={"tau1": "motor"})
@@ -215,22 +215,20 @@ def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
         Recording.read("log.csv", columns="q1=enc:deg")  # type: ignore[arg-type]
 
 
-def test_foreign_csv_with_blanks_and_byte_order_mark(tmp_path: Path) -> None:
+def test_csv_with_blanks_and_byte_order_mark_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{k / 1000}, {k / 7!r}\r\n" for k in range(20))
     (tmp_path / "a.csv").write_bytes(("\ufefftime, q1\r\n" + rows).encode())
     back = Recording.read(tmp_path / "a.csv")
     assert np.array_equal(back.q[:, 0], np.arange(20) / 7)
 
 
-def test_compressed_files_do_not_depend_on_the_moment(tmp_path: Path) -> None:
+def test_compressed_files_do_not_contain_the_time(tmp_path: Path) -> None:
     swing().write(tmp_path / "a.csv.gz")
     swing().write(tmp_path / "b.csv.gz")
     assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
 
 
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.csv"
     swing().write(path)
     before = path.read_bytes()
@@ -259,7 +257,7 @@ def test_truncated_files_are_named(tmp_path: Path, ending: str, share: float) ->
         Recording.read(path)
 
 
-def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
+def test_absent_empty_and_unknown_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no recording at .*lost\.csv"):
         Recording.read(tmp_path / "lost.csv")
     with pytest.raises(ValueError, match=r"run\.doc.*must end in one of \.csv"):
@@ -295,7 +293,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("time,q1,q2\n" + "".join(f"{k},0,0\n" for k in range(9)) + "9,0\n", "`q2` .*sample 9"),
     ],
 )
-def test_malformed_csv(tmp_path: Path, text: str, message: str) -> None:
+def test_malformed_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(text.encode()))
     with pytest.raises(ValueError, match=message) as caught:
@@ -303,14 +301,16 @@ def test_malformed_csv(tmp_path: Path, text: str, message: str) -> None:
     assert "run.csv.gz" in str(caught.value)
 
 
-def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_without_pyarrow_names_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     swing().write(tmp_path / "run.parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ImportError, match=r"pip install nfriction\[parquet\]"):
         Recording.read(tmp_path / "run.parquet")
 
 
-def test_an_array_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
+def test_array_that_declares_more_data_than_it_has_is_refused(tmp_path: Path) -> None:
     header = io.BytesIO()
     claim = {"descr": "<f8", "fortran_order": False, "shape": (10**15,)}
     np.lib.format.write_array_header_1_0(header, claim)  # type: ignore[arg-type]
@@ -320,20 +320,20 @@ def test_an_array_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> Non
         Recording.read(tmp_path / "run.npz")
 
 
-def test_files_go_to_folders_that_are_made(tmp_path: Path) -> None:
+def test_missing_folders_are_created(tmp_path: Path) -> None:
     recording = Recording(np.arange(9.0) / 100, np.zeros((9, 1)))
     recording.write(tmp_path / "a" / "b" / "run.csv")
     assert Recording.read(tmp_path / "a" / "b" / "run.csv").digest() == recording.digest()
 
 
-def test_text_in_a_table_from_elsewhere_is_not_guessed_at() -> None:
+def test_text_in_foreign_tables_is_refused() -> None:
     table = swing().to_pandas().astype({"q1": object})
     table["q1"] = "35,000"
     with pytest.raises(ValueError, match=r"column q1, row 0 .* must be a number, got '35,000'"):
         Recording.from_pandas(table)
 
 
-def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
+def test_foreign_tables_may_have_numbered_or_repeated_columns() -> None:
     time, q = np.arange(20) / 1000, np.arange(20) / 50
     numbered = pd.DataFrame({0: time, 1: q})
     for columns in ({"time": "0", "q1": "1"}, {"time": 0, "q1": 1}):
@@ -391,13 +391,13 @@ def test_bad_arrays_are_refused(parts: dict[str, object], message: str) -> None:
         changed(**parts)
 
 
-def test_too_few_samples() -> None:
+def test_too_few_samples_are_refused() -> None:
     assert len(swing()[:8]) == 8
     with pytest.raises(ValueError, match="at least 8 samples, got 7"):
         swing()[:7]
 
 
-def test_tensors_are_taken_without_a_word() -> None:
+def test_tensors_are_accepted_without_warnings() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         recording = Recording(torch.arange(20) / 100, torch.ones(20, 1))  # type: ignore[arg-type]
@@ -415,7 +415,7 @@ def test_arrays_are_copies_and_read_only() -> None:
 
 @pytest.mark.parametrize("count", [2 * np.pi / 4096, 1e-12])
 @pytest.mark.parametrize("held", [2, 5])
-def test_positions_of_a_slower_sensor_are_noticed(count: float, held: int) -> None:
+def test_positions_of_a_slower_sensor_raise_a_warning(count: float, held: int) -> None:
     time = 2e-3 * np.arange(2000)
     q = count * np.round(np.sin(3 * time)[:, None] / count)
     with warnings.catch_warnings():
@@ -433,7 +433,7 @@ def test_positions_of_a_slower_sensor_are_noticed(count: float, held: int) -> No
 @pytest.mark.parametrize(
     ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
 )
-def test_a_wrong_unit_of_time_is_noticed(factor: float, unit: str) -> None:
+def test_wrong_time_unit_raises_a_warning(factor: float, unit: str) -> None:
     recording = swing()
     with pytest.warns(RecordingWarning, match=unit):
         Recording(recording.time * factor, recording.q)
@@ -447,7 +447,7 @@ def test_an_axis_in_milliseconds_is_not_taken_for_a_wrapped_angle() -> None:
     assert not any("wrapped" in str(w.message) for w in caught)
 
 
-def test_gaps_are_noticed_and_jitter_is_not() -> None:
+def test_gaps_raise_a_warning_and_jitter_does_not() -> None:
     time = np.arange(100) / 100
     jitter = np.random.default_rng(0).uniform(-4e-3, 4e-3, 100)
     with warnings.catch_warnings():
@@ -457,14 +457,14 @@ def test_gaps_are_noticed_and_jitter_is_not() -> None:
         Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
 
 
-def test_stamps_of_packets_are_told_from_gaps() -> None:
+def test_packet_time_stamps_are_distinguished_from_gaps() -> None:
     """Five samples within microseconds, every 10 ms."""
     time = np.arange(100) // 5 / 100 + np.arange(100) % 5 * 1e-6
     with pytest.warns(RecordingWarning, match=r"gaps \(19\).* if samples came in packets, give"):
         Recording(time, np.zeros((100, 1)))
 
 
-def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None:
+def test_mask_removes_samples_and_does_not_repeat_warnings() -> None:
     time = np.arange(100) / 100
     columns = {"tau": 2.0 * time[:, None], "qd": 3.0 * time[:, None]}
     recording = Recording(time, time[:, None], **columns, convention="relative,upright", name="a")
@@ -485,7 +485,7 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
 
 
 @pytest.mark.parametrize(
-    ("column", "options", "told"),
+    ("column", "options", "warning_count"),
     [
         ("position", {"columns": {"q1": "position:counts/4096"}}, 0),
         ("position [deg]", {"columns": {"q1": "position [deg]"}}, 0),
@@ -494,34 +494,32 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
         ("q1", {}, 1),
     ],
 )
-def test_a_wheel_whose_unit_is_stated_is_not_taken_for_one_in_degrees(
-    column: str, options: dict[str, Any], told: int
+def test_stated_unit_of_a_wheel_is_not_doubted(
+    column: str, options: dict[str, Any], warning_count: int
 ) -> None:
     time = 0.01 * np.arange(100)
     table = pd.DataFrame({"time": time, column: np.rint(1e4 * np.sqrt(time)) / 2})
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Recording.from_pandas(table, **options)
-    assert sum("degrees" in str(warning.message) for warning in said) == told
+    assert sum("degrees" in str(warning.message) for warning in caught) == warning_count
 
 
-def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
+def test_rotating_joints_are_not_taken_for_degrees_or_wrapped() -> None:
     time = np.arange(2000) * 1e-3
     whirling = 25.0 * time[:, None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Recording(time, whirling)
-    with pytest.warns(RecordingWarning) as said:
+    with pytest.warns(RecordingWarning) as caught:
         Recording(time, np.remainder(whirling, 2 * np.pi))
-    assert not any("degrees" in str(warning.message) for warning in said)
+    assert not any("degrees" in str(warning.message) for warning in caught)
 
 
 @pytest.mark.parametrize("low", [0.0, -np.pi])
 @pytest.mark.parametrize("sample_time", [1e-3, 0.05])
-def test_wrapped_angles_are_noticed_and_their_joint_is_named(
-    low: float, sample_time: float
-) -> None:
-    """The second joint of two goes round, up to a quarter of a turn to a sample."""
+def test_wrapped_angles_raise_a_warning_with_their_joint(low: float, sample_time: float) -> None:
+    """The second joint of two rotates, by up to a quarter of a turn per sample."""
     time = np.arange(400) * sample_time
     q = np.stack([np.sin(time), 25.0 * time]).T
     with warnings.catch_warnings():
@@ -532,10 +530,10 @@ def test_wrapped_angles_are_noticed_and_their_joint_is_named(
         Recording(time, np.stack([q[:, 0], wrapped[:, 1]]).T, names=("hip", "elbow"), name="a")
 
 
-def test_what_jumps_by_a_turn_for_other_reasons_is_not_taken_for_wrapped() -> None:
+def test_other_jumps_by_a_turn_are_not_taken_for_wrapped_angles() -> None:
     time = np.arange(400) * 1e-2
     turn = 2 * np.pi * (time >= 2)[:, None]
-    # Steps of the degrees grow to a turn of 2π and beyond.
+    # Steps in degrees grow to a turn of 2π and beyond.
     degrees = 180 * np.sin(6 * time)[:, None]
     assert np.abs(np.diff(degrees, axis=0)).max() > 3 * np.pi
     with warnings.catch_warnings():
@@ -561,7 +559,7 @@ def test_slices_keep_everything_else() -> None:
         recording[3]  # type: ignore[index]
 
 
-def test_irregular_stamps_are_kept_and_told() -> None:
+def test_irregular_time_stamps_are_kept_and_reported() -> None:
     assert not swing().is_uniform
     time = np.round(np.arange(100) / 700, 6)
     assert Recording(time, np.zeros((100, 1))).is_uniform
@@ -569,7 +567,7 @@ def test_irregular_stamps_are_kept_and_told() -> None:
     assert all(part in text for part in ("'run'", "samples=60", "irregular", "'tau'", "joint2"))
 
 
-def test_digest_sees_content_and_nothing_else() -> None:
+def test_digest_depends_only_on_the_content() -> None:
     base = swing().digest()
     assert swing(name="other").digest() == base
     assert len(base) == 64
@@ -585,7 +583,7 @@ def test_digest_sees_content_and_nothing_else() -> None:
     assert len({base, *(other.digest() for other in others)}) == 6
 
 
-def test_joint_coordinates() -> None:
+def test_joint_coordinates_follow_the_convention() -> None:
     recording = swing(joints=3, convention=AngleConvention("absolute", "hanging"))
     on_arm = Rig(("relative", "upright"), 1)
     joint = recording.joint_coordinates(on_arm)
@@ -599,34 +597,34 @@ def test_joint_coordinates() -> None:
     assert axis.joint_coordinates() is axis
 
 
-def test_metres_are_no_angles_of_a_plant() -> None:
+def test_unit_must_match_the_plant() -> None:
     turns, slides = (Rig(("relative", "upright"), 0, unit) for unit in ("rad", "m"))
     for unit, plant in (("m", turns), ("rad", slides)):
         recording = swing(unit=unit, name="run")
-        said = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
-        with pytest.raises(ValueError, match=said):
+        message = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
+        with pytest.raises(ValueError, match=message):
             recording.resolve_convention(plant)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             recording.joint_coordinates(plant)
 
 
-def test_what_a_recording_does_not_say_the_plant_says() -> None:
+def test_plant_supplies_a_missing_convention() -> None:
     hanging = Rig(("absolute", "hanging"), 0)
-    said = swing(convention="absolute,hanging")
-    unsaid = replace(said, convention=None)
-    assert unsaid.convention is None
-    assert unsaid.resolve_convention(hanging) == said.convention
-    assert unsaid.joint_coordinates(hanging).digest() == said.joint_coordinates().digest()
-    # What it says itself is stronger.
-    assert said.resolve_convention(Rig(("relative", "upright"), 0)) == said.convention
+    stated = swing(convention="absolute,hanging")
+    unstated = replace(stated, convention=None)
+    assert unstated.convention is None
+    assert unstated.resolve_convention(hanging) == stated.convention
+    assert unstated.joint_coordinates(hanging).digest() == stated.joint_coordinates().digest()
+    # Its own convention takes precedence.
+    assert stated.resolve_convention(Rig(("relative", "upright"), 0)) == stated.convention
     with pytest.raises(ValueError, match="has no angle convention; give the plant"):
-        unsaid.joint_coordinates()
-    assert unsaid.digest() != said.digest()
-    assert "that of the plant" in repr(unsaid)
+        unstated.joint_coordinates()
+    assert unstated.digest() != stated.digest()
+    assert "that of the plant" in repr(unstated)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_convention_that_is_not_said_stays_so(tmp_path: Path, ending: str) -> None:
+def test_unstated_convention_remains_unstated(tmp_path: Path, ending: str) -> None:
     swing().write(tmp_path / f"run{ending}")
     back = Recording.read(tmp_path / f"run{ending}")
     assert back.convention is None
@@ -644,7 +642,7 @@ def test_a_convention_that_is_not_said_stays_so(tmp_path: Path, ending: str) -> 
         Rig(("absolute", "hanging"), 0),
     ],
 )
-def test_a_convention_is_said_in_many_ways(tmp_path: Path, given: Any) -> None:
+def test_convention_may_be_given_in_several_forms(tmp_path: Path, given: Any) -> None:
     swing().write(tmp_path / "run.csv")
     expected = AngleConvention("absolute", "hanging")
     assert Recording.read(tmp_path / "run.csv", convention=given).convention == expected
@@ -654,7 +652,7 @@ def test_a_convention_is_said_in_many_ways(tmp_path: Path, given: Any) -> None:
 
 @pytest.mark.parametrize("given", ["", "sideways", (), ("absolute", 3), 7, object(), True])
 def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
-    # Before the file is looked for.
+    # Before the file is opened.
     with pytest.raises(ValueError, match="`convention` must be one of"):
         Recording.read("absent.csv", convention=given)
     with pytest.raises(ValueError, match="`convention` must be one of"):
@@ -664,7 +662,7 @@ def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
 # --- the real files --------------------------------------------------------------------------
 
 
-def test_real_files_read_silently_and_their_degrees_are_noticed(data_dir: Path) -> None:
+def test_real_files_read_silently_and_degrees_raise_a_warning(data_dir: Path) -> None:
     # Some sets are tables of friction over velocity, not recordings of a motion.
     paths = [
         path
@@ -686,7 +684,7 @@ def test_real_files_read_silently_and_their_degrees_are_noticed(data_dir: Path) 
                 Recording(recording.time, np.rad2deg(recording.q))
 
 
-def test_initial_states_of_the_real_sets(data_dir: Path) -> None:
+def test_initial_states_of_the_real_sets_match_the_recordings(data_dir: Path) -> None:
     multiarm = read_initial_states(data_dir / "multiarm_pendulum" / "recordings.csv")
     assert {key: len(q0) for key, (q0, _) in multiarm.items() if key.endswith("b0")} == {
         "single_b0": 1,
@@ -704,7 +702,7 @@ def test_initial_states_of_the_real_sets(data_dir: Path) -> None:
             assert np.abs(q0 - recording.q[0]).max() < 3e-3
 
 
-def test_initial_states_name_their_faults(tmp_path: Path) -> None:
+def test_invalid_initial_states_raise_clear_errors(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_text("id,q0_1\na,0.5\n")
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
@@ -733,7 +731,7 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.rad2deg(parts), states[label], rtol=4e-16)
 
 
-def test_a_message_on_missing_columns_offers_those_that_look_right() -> None:
+def test_missing_columns_error_suggests_similar_names() -> None:
     table = (
         swing().to_pandas().rename(columns={"time": "Zeit [ms]", "q1": "Winkel 1", "q2": "enc_2"})
     )
@@ -748,12 +746,12 @@ GEARED = Rotor(0.02, motor=Motor(gear_ratio=50, torque_constant=0.03))
 
 
 def motor_log(**columns: object) -> pd.DataFrame:
-    """A table of a motor's counts of 1000 a turn and its current."""
+    """A table with a motor's encoder counts, 1000 per turn, and its current."""
     log = {"time": 0.01 * np.arange(20), "enc": 1000 * np.arange(20), "I": np.linspace(-1, 1, 20)}
     return pd.DataFrame(log | columns)
 
 
-def test_angle_and_current_of_a_motor_become_those_of_its_joint() -> None:
+def test_motor_angle_and_current_are_converted_to_the_joint() -> None:
     columns = {"motor1": "enc:counts/1000", "current1": "I"}
     recording = Recording.from_pandas(motor_log(), columns=columns, plant=GEARED)
     np.testing.assert_allclose(recording.q[:, 0], 2 * np.pi / 50 * np.arange(20))
@@ -776,7 +774,7 @@ def test_a_motor_on_a_screw_may_be_logged_in_degrees() -> None:
         Recording.from_pandas(table.assign(qd1=0.0), degrees=True, plant=axis)
 
 
-def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
+def test_joint_columns_precede_motor_columns_unless_named() -> None:
     table = motor_log(q1=0.1, tau1=2.0, motor1=5.0, current1=1.0)
     recording = Recording.from_pandas(table, plant=GEARED)
     assert recording.q[0, 0] == 0.1
@@ -788,7 +786,7 @@ def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
         Recording.from_pandas(table, columns={"q1": "q1", "motor1": "enc"}, plant=GEARED)
 
 
-def test_a_joint_without_a_current_beside_others_is_named_by_its_motor() -> None:
+def test_joint_without_a_current_is_named_by_its_motor() -> None:
     arm = PendulumChain([1.0, 0.5], [0.3, 0.2], motor=Motor(50, torque_constant=0.03))
     table = motor_log(motor1=1.0, motor2=0.5, current1=0.1)
     with pytest.warns(RecordingWarning, match=r"no column current2, .* columns={\"current2\": "):
@@ -802,14 +800,14 @@ def test_a_motor_unknown_to_the_rig_is_named() -> None:
     rig = Rotor(0.02, motor=Motor(50))
     with pytest.raises(ValueError, match=r"current1 belongs to a motor.*`torque_constant`"):
         Recording.from_pandas(table, columns={"current1": "I"}, plant=rig)
-    # A column that happens to be there is no reason to stop.
+    # An unused column is no reason to stop.
     with pytest.warns(RecordingWarning, match="looks like motor current"):
         found = Recording.from_pandas(table.rename(columns={"I": "current1"}), plant=rig)
     assert found.tau is None
 
 
 @pytest.mark.parametrize("size", [1.0, 20.0])
-def test_positions_in_whole_degrees_or_counts_are_refused(size):
+def test_positions_in_integer_degrees_or_counts_are_refused(size):
     q, time = np.rint(np.linspace(0, 360 * size, 50))[:, None], np.arange(50) / 100
     with pytest.raises(ValueError, match=r"radians, got only whole numbers, from 0 to .*counts"):
         Recording(time, q)
@@ -818,8 +816,8 @@ def test_positions_in_whole_degrees_or_counts_are_refused(size):
 
 
 @pytest.mark.parametrize(("torque", "doubted"), [(1.0, False), (0.0, True), (None, True)])
-def test_fast_turning_is_doubted_only_without_torques(torque: float | None, doubted: bool) -> None:
-    """With torques, their balance shows whether a fast motion is one of a wheel or in degrees."""
+def test_fast_rotation_is_doubted_only_without_torques(torque: float | None, doubted: bool) -> None:
+    """With torques, their balance shows whether a wheel is fast or its angles are in degrees."""
     time = np.linspace(0.0, 1.0, 60)
     q, tau = 50.0 * time[:, None], None if torque is None else np.full((60, 1), torque)
     with warnings.catch_warnings(record=True) as caught:

@@ -1,4 +1,4 @@
-"""Reading tables of friction torque, and refusing what is none."""
+"""Reading tables of friction torque, and refusing invalid ones."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ def table(**columns: object) -> pd.DataFrame:
     return pd.DataFrame({"qd": QD, "tau": np.sign(QD) + QD} | columns)
 
 
-def test_wide_and_long_tables_are_the_same() -> None:
+def test_wide_and_long_tables_are_equivalent() -> None:
     wide = pd.DataFrame({"qd1": QD, "tau_f1": QD, "qd2": 2 * QD, "tau_f2": 3 * QD, "load": 1 + QD})
     parts = [
         pd.DataFrame({"joint": k, "velocity": k * QD, "torque": tau * QD, "load": 1 + QD})
@@ -31,7 +31,7 @@ def test_wide_and_long_tables_are_the_same() -> None:
         np.testing.assert_array_equal(found.joints[1].load, 1 + QD)
 
 
-def test_units_and_names_of_a_german_file_are_followed(tmp_path: Path) -> None:
+def test_units_and_names_of_a_german_file_are_understood(tmp_path: Path) -> None:
     path = tmp_path / "tests.csv"
     rows = [f"{np.rad2deg(v):.6f};{1e3 * v:.6f}".replace(".", ",") for v in QD]
     path.write_text("Drehzahl [deg/s];tau [mN m]\n" + "\n".join(rows) + "\n")
@@ -43,13 +43,13 @@ def test_units_and_names_of_a_german_file_are_followed(tmp_path: Path) -> None:
     np.testing.assert_allclose(degrees.joints[0].qd, QD)
 
 
-def test_a_speed_named_by_its_unit_is_read_in_it() -> None:
+def test_unit_in_a_speed_column_name_is_used() -> None:
     given = pd.DataFrame({"speed_rpm": QD * 30 / np.pi, "torque": QD})
     found = TorqueTable.from_pandas(given, columns={"qd": "speed_rpm"})
     np.testing.assert_allclose(found.joints[0].qd, QD)
 
 
-def test_velocity_comes_from_positions_in_time() -> None:
+def test_velocity_is_computed_from_positions_and_time() -> None:
     time = np.arange(400) * 0.01
     given = pd.DataFrame({"time": time, "position": np.sin(time), "friction": np.cos(time)})
     joint = TorqueTable.from_pandas(given, unit="m").joints[0]
@@ -77,12 +77,12 @@ def test_velocity_comes_from_positions_in_time() -> None:
         (table(joint=[1.0] * 19 + [np.nan]), "column joint, row 19 .* names no joint"),
     ],
 )
-def test_what_is_no_table_is_refused(given: pd.DataFrame, message: str) -> None:
+def test_files_that_are_no_table_are_refused(given: pd.DataFrame, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TorqueTable.from_pandas(given)
 
 
-def test_wrong_names_of_columns_are_refused() -> None:
+def test_wrong_column_names_are_refused() -> None:
     with pytest.raises(ValueError, match="no column 'speed'; found qd, tau"):
         TorqueTable.from_pandas(table(), columns={"qd": "speed"})
     with pytest.raises(ValueError, match="got the key 'voltage'"):
@@ -91,7 +91,7 @@ def test_wrong_names_of_columns_are_refused() -> None:
         TorqueTable.from_pandas(table(), unit="deg")  # type: ignore[arg-type]
 
 
-def test_a_unit_of_sliding_joints_needs_to_be_stated(tmp_path: Path) -> None:
+def test_unit_of_sliding_joints_must_be_stated(tmp_path: Path) -> None:
     path = tmp_path / "axis.csv"
     table(qd=1e3 * QD).rename(columns={"qd": "qd [mm/s]"}).to_csv(path, index=False)
     with pytest.raises(ValueError, match=r"column qd .*is in mm/s; .*--unit m"):
@@ -99,7 +99,7 @@ def test_a_unit_of_sliding_joints_needs_to_be_stated(tmp_path: Path) -> None:
     np.testing.assert_allclose(TorqueTable.read(path, unit="m").joints[0].qd, QD)
 
 
-def test_doubts_are_remarked() -> None:
+def test_suspicious_tables_raise_remarks() -> None:
     reversed_sign = TorqueTable.from_pandas(table(tau=-np.sign(QD) - QD))
     assert "wrong sign" in reversed_sign.remarks[0]
     time = np.arange(2000) * 0.01
@@ -119,7 +119,7 @@ def test_doubts_are_remarked() -> None:
     assert not TorqueTable.from_pandas(table()).remarks
 
 
-def test_a_digest_follows_the_content() -> None:
+def test_digest_depends_on_the_content() -> None:
     one, same = (TorqueTable.from_pandas(table()) for _ in range(2))
     assert one.digest() == same.digest()
     assert one.digest() != TorqueTable.from_pandas(table(tau=QD)).digest()
@@ -135,7 +135,7 @@ def speeds(noise: float = 0.005, repeats: int = 1, seed: int = 0) -> pd.DataFram
     )
 
 
-def test_copies_of_rows_are_not_distinct_but_coarse_readings_are() -> None:
+def test_copied_rows_are_not_distinct_but_coarse_readings_are() -> None:
     def kept(table: pd.DataFrame) -> int:
         return len(TorqueTable.from_pandas(table).joints[0].distinct)
 
@@ -147,10 +147,10 @@ def test_copies_of_rows_are_not_distinct_but_coarse_readings_are() -> None:
         assert kept(table) == len(table)
         assert kept(pd.concat([table] * 3)) == len(table)
         assert kept(pd.concat([table] * 3).sort_values("tau")) == len(table)
-    # A quiet coarse sensor gives the same reading each time; as copies too few rows would remain.
+    # A quiet coarse sensor repeats its reading; counted as copies, too few rows would remain.
     quiet = pd.DataFrame({"qd": np.repeat([1.0, 2.0, -1.0, -2.0], 10)})
     assert kept(quiet.assign(tau=0.1 * quiet.qd)) == 40
-    # With time there is no doubt.
+    # With time stamps there is no doubt.
     timed = fine.assign(time=np.arange(160.0))
     copied = TorqueTable.from_pandas(pd.concat([timed, timed[40:]]))
     assert len(copied.joints[0]) == 160

@@ -1,4 +1,4 @@
-"""A comparison's folder, made quickly and with names that mean no good."""
+"""Folder of a comparison, made quickly and with hostile names."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ JOINTS = ["a<b>", "second"]
 
 
 def errors(scale: float | None) -> dict[str, Any]:
-    """An error of two joints, as `RMSE.to_dict` writes it; None diverged."""
+    """An error of two joints in the format of `RMSE.to_dict`; None for diverged."""
     return {"joints": [scale, scale], "all": scale}
 
 
@@ -77,7 +77,7 @@ def results() -> dict[str, Any]:
 
 
 def neuro_fuzzy() -> NFLFM:
-    """A model whose rules differ and whose joints have ranges of their own."""
+    """A model whose rules differ and whose joints have different ranges."""
     model = NFLFM(2, [2e-3, 1e-2])
     model.schedule.set_range(torch.tensor([10.0, 5.0]), torch.tensor([[-60.0, 20.0], [-30, 30]]))
     start = model.schedule.parameter_vector()
@@ -87,7 +87,7 @@ def neuro_fuzzy() -> NFLFM:
 
 
 def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
-    """A run's folder with two model files and two figures."""
+    """Folder of a run with two model files and two figures."""
     folder.mkdir(parents=True, exist_ok=True)
     content = checked_json(results() if content is None else content)
     (folder / "results.json").write_text(json.dumps(content))

@@ -1,4 +1,4 @@
-"""The page in a browser: tables sort, figures open and grow, nothing is wider than the screen."""
+"""The page in a browser: tables sort, figures open and grow, nothing exceeds the screen width."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
     BROWSER is None, reason="no Chromium here; install the package `chromium` to run this"
 )
 
-# Runs beside two frames that hold the page, each as wide as a screen.
+# Runs next to two frames that contain the page, each as wide as a screen.
 PROBE = """
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
 const report = (found) => fetch("/found", {method: "POST", body: JSON.stringify(found)});
@@ -92,7 +92,7 @@ def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
 
 
 def found_in_browser(page: Path, profile: Path, *options: str) -> Any:
-    """The page's report; the browser stays open until the page has posted it."""
+    """Report of the probe; the browser stays open until the page has posted it."""
     answers: Queue[bytes] = Queue()
 
     class Handler(SimpleHTTPRequestHandler):
@@ -153,11 +153,11 @@ def test_figures_open_grow_and_close(looks):
         assert look["closed"]
 
 
-def test_what_is_pressed_is_large_enough_for_a_finger(looks):
+def test_touch_targets_are_large_enough(looks):
     assert all(look["narrow"] == 0 for look in looks)
 
 
-def test_a_dark_screen_shows_dark_figures_small_and_large(tmp_path):
+def test_dark_mode_shows_dark_figures_small_and_large(tmp_path):
     page = escape(to_html(read_run(write(tmp_path / "run"))))
     outer = tmp_path / "outer.html"
     outer.write_text(

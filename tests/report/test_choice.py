@@ -39,9 +39,9 @@ def test_without_a_choice_there_is_no_section(tmp_path: Path) -> None:
         assert "Model selection (training data only)" not in to_html(run)
 
 
-def test_failed_models_and_warnings_of_test_recordings_are_told(tmp_path: Path) -> None:
+def test_failed_models_and_warnings_of_test_recordings_are_shown(tmp_path: Path) -> None:
     found = {"failed": {"ALFM": f"no classes {EVIL}"}, "test_warnings": [f"b: a mistake {EVIL}"]}
     page = to_html(read_run(folder(tmp_path, **found)))
-    for said in ("Not fitted. ", "no classes", "<li>b: a mistake "):
-        assert said in page
+    for expected in ("Not fitted. ", "no classes", "<li>b: a mistake "):
+        assert expected in page
     assert EVIL not in page

@@ -1,4 +1,4 @@
-"""The page needs nothing else, escapes what it was given, and says what the run says."""
+"""The page is self-contained, escapes its input, and shows the contents of the run."""
 
 import itertools
 import math
@@ -54,7 +54,7 @@ def page(html):
     return Page(html)
 
 
-def test_nothing_comes_from_outside(html, page):
+def test_page_has_no_external_resources(html, page):
     for tag, attributes in page.tags:
         for key in ("src", "srcset", "href", "action", "poster", "data"):
             reference = attributes.get(key)
@@ -66,19 +66,19 @@ def test_nothing_comes_from_outside(html, page):
     assert "@import" not in style
 
 
-def test_what_files_say_is_text(html, page):
+def test_contents_of_files_are_escaped(html, page):
     assert len(page.all("script")) == 1
     assert EVIL not in html
-    assert EVIL in "".join(page.text)  # and reads as it was written
+    assert EVIL in "".join(page.text)  # and is shown unchanged
 
 
-def test_the_policy_lets_only_the_pages_own_script_run(page):
+def test_security_policy_allows_only_the_pages_own_script(page):
     (policy,) = (m["content"] for m in page.all("meta") if "http-equiv" in m)
     assert policy.startswith("default-src 'none'")
     assert "unsafe" not in policy
 
 
-def test_wide_figures_get_the_width_of_the_page(page):
+def test_wide_figures_use_the_width_of_the_page(page):
     assert [figure.get("class") for figure in page.all("figure")] == [None, "wide"]
 
 
@@ -88,8 +88,8 @@ def luminance(rgb: np.ndarray) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_on_a_dark_screen_text_and_lines_of_figures_stand_out():
-    """Colours as the style's filter shows them (W3C Filter Effects: invert, hue-rotate)."""
+def test_figures_have_enough_contrast_in_dark_mode():
+    """Colours as shown by the style's filter (W3C Filter Effects: invert, hue-rotate)."""
     css = (resources.files("nfriction.report") / "templates" / "page.css").read_text()
     (inverted,) = re.findall(r"filter: invert\(([\d.]+)\) hue-rotate\(180deg\)", css)
     grey = np.array([0.213, 0.715, 0.072])
@@ -115,7 +115,7 @@ def test_an_animation_moves_on_the_page(tmp_path):
     assert "simulated motion of the best model" in shown["alt"]
 
 
-def test_what_a_reader_of_the_screen_needs(page):
+def test_screen_readers_get_headings_and_alternative_texts(page):
     assert page.all("html")[0]["lang"] == "en"
     assert all(a["alt"] for a in page.all("img")[:-1])  # the last one is the empty large picture
     tables = len(page.all("table"))
@@ -128,9 +128,9 @@ def test_what_a_reader_of_the_screen_needs(page):
     assert anchors == {a["id"] for a in page.all("h2")}
 
 
-def test_verdicts_warnings_and_rules_are_told(page):
+def test_verdicts_warnings_and_rules_are_shown(page):
     text = " ".join("".join(page.text).split())
-    for said in (
+    for expected in (
         "load-coulomb (LFM) predicts the test recordings best: 100 mrad, where no friction leaves "
         "2000.",
         "Fit of load-coulomb (LFM): good",
@@ -145,11 +145,11 @@ def test_verdicts_warnings_and_rules_are_told(page):
         "nfriction export",
         "training recording",
     ):
-        assert said in text
+        assert expected in text
     assert text.count("At a bound") == 1
 
 
-def test_a_rejected_network_has_no_rules_and_an_unnamed_rig_is_called_so(tmp_path):
+def test_rejected_network_has_no_rules_and_unnamed_rig_is_marked(tmp_path):
     folder = write(tmp_path)
     info = ModelInfo(joint_names=JOINTS, rig={"name": ""})
     for model in (LFM(2, [2e-3, 1e-2]), NFLFM(2, [2e-3, 1e-2])):
@@ -160,8 +160,8 @@ def test_a_rejected_network_has_no_rules_and_an_unnamed_rig_is_called_so(tmp_pat
     assert "Rig: unnamed." in text
 
 
-def test_errors_within_the_limit_of_the_least_are_grey_and_the_limit_is_the_last_row(tmp_path):
-    """LFM has 100 mrad, NFLFM 200; in simulations of LFM the start alone may cause 150."""
+def test_errors_within_the_limit_of_the_least_are_grey(tmp_path):
+    """LFM has 100 mrad, NFLFM 200; for LFM the initial state alone may cause 150."""
     content = results()
     near = {"joints": [0.15, 0.01], "all": 0.15}
     content["models"]["LFM"]["test"][EVIL]["limit"] = {"free_run": near, "windows": {}}
@@ -178,7 +178,7 @@ def test_errors_within_the_limit_of_the_least_are_grey_and_the_limit_is_the_last
     assert '<tfoot><tr><th scope="row">limit of these data</th><td>150</td>' in html
 
 
-def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):
+def test_least_error_of_a_column_is_marked_but_never_a_diverged_one(tmp_path):
     table = error_table(read_run(write(tmp_path)).comparison, "test")
     marked = {(r[0], k) for r in table.rows for k in range(len(r)) if table.is_marked(r, k)}
     assert marked == {("LFM", k) for k in range(1, 5)}
@@ -193,5 +193,5 @@ def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path
     [(12345.6, "12346"), (0.0123456, "0.01235"), (1234.4, "1234"), (math.inf, "unknown"),
      (math.nan, "n/a"), (0.0, "0"), (1e-12, "0"), (2e-6, "2e-06")],
 )  # fmt: skip
-def test_numbers_read_plainly(value, text):
+def test_numbers_are_rounded_for_reading(value, text):
     assert Table("", (), ()).text(value) == text

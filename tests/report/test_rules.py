@@ -1,4 +1,4 @@
-"""Rules in words are the model's own coefficients at the middle of the words' sets."""
+"""Rules in words equal the model's coefficients at the centres of their sets."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from nfriction.report import rules_in_words
 from tests.report.runs import neuro_fuzzy
 
 
-def test_a_rule_says_what_the_model_gives_where_its_words_hold():
+def test_rule_values_equal_the_models_coefficients_at_their_sets():
     model = neuro_fuzzy()
     for j, of in enumerate(rules_in_words(model, ["one", "two"])):
         assert len(of.rules) == 25
@@ -19,14 +19,14 @@ def test_a_rule_says_what_the_model_gives_where_its_words_hold():
             qdd = torch.full((2,), acceleration[rule.acceleration], dtype=torch.float64)
             if qd[j] == 0:  # acceleration along the motion has no meaning at rest
                 continue
-            said = torch.tensor(rule.values, dtype=torch.float64)
+            expected = torch.tensor(rule.values, dtype=torch.float64)
             # tanh of the direction is 1 to rounding at these speeds.
             torch.testing.assert_close(
-                said, model.coefficients(qd, qdd)[j].detach(), rtol=1e-9, atol=0
+                expected, model.coefficients(qd, qdd)[j].detach(), rtol=1e-9, atol=0
             )
 
 
-def test_an_untrained_model_says_its_constant_law_in_every_rule():
+def test_untrained_model_has_its_constant_law_in_every_rule():
     (of,) = rules_in_words(NFLFM(1, [2e-3, 1e-2]))
     assert all(rule.values == pytest.approx((2e-3, 1e-2), rel=1e-9) for rule in of.rules)
     sentence = of.rules[12].sentence([("B", "N m s/rad"), ("C", "N m")])
@@ -45,7 +45,7 @@ def test_words_are_unique_and_in_order(terms):
         assert [t.centre for t in words] == sorted(t.centre for t in words)
 
 
-def test_zero_lies_where_it_is_not_in_the_middle():
+def test_zero_is_named_correctly_in_asymmetric_ranges():
     model = NFLFM(1)
     model.schedule.set_range(10.0, [-100.0, 20.0])
     (of,) = rules_in_words(model)
@@ -59,7 +59,7 @@ def test_zero_lies_where_it_is_not_in_the_middle():
     }  # fmt: skip
 
 
-def test_sets_that_changed_places_change_words():
+def test_swapped_sets_swap_words():
     model = NFLFM(1)
     with torch.no_grad():
         centres = model.schedule.network.anfis.partition.centres
@@ -74,7 +74,7 @@ def test_models_without_rules_have_none_and_names_must_fit():
         rules_in_words(NFLFM(2), ["one"])
 
 
-def test_every_second_of_a_motion_fires_some_rule() -> None:
+def test_every_sample_of_a_motion_fires_some_rule() -> None:
     model = NFLFM(1, terms=(3, 3))
     model.schedule.set_range(10.0, [-50.0, 50.0])
     step = torch.tensor([0.5, 1.5, 1.0]).double()

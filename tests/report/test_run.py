@@ -1,4 +1,4 @@
-"""Folders that are no run are refused in a line; what is missing is said."""
+"""Folders without a run are refused in one line; missing parts are reported."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("run"))
 
 
-def test_a_run_is_what_its_files_say(folder):
+def test_run_contains_what_is_in_its_files(folder):
     run = read_run(folder)
     assert run.best == "LFM"
     assert list(run.fits) == ["LFM", "NLFM", "NFLFM"]
@@ -23,19 +23,19 @@ def test_a_run_is_what_its_files_say(folder):
     assert run.comparison.scores()["NLFM"][0].diverged_at == 0.5
     assert {f.name for f in run.figures} == {"positions_train_calm", "rmse_test"}
     assert (run.figures[0].width, run.figures[0].height) == (800, 200)
-    assert any("NLFM" in note for note in run.notes)  # its model file is not there
+    assert any("NLFM" in note for note in run.notes)  # its model file is missing
 
 
-def test_a_damaged_model_or_figure_is_said_and_does_not_stop_the_report(tmp_path):
+def test_damaged_model_or_figure_is_reported_without_stopping(tmp_path):
     folder = write(tmp_path)
     path = folder / "models" / "LFM.json"
     path.write_bytes(path.read_bytes()[:-20])
     (folder / "figures" / "rmse_test.png").write_text("<svg onload=alert(1)>")
     run = read_run(folder)
     assert "LFM" not in run.models
-    said = " ".join(run.notes)
-    assert "LFM" in said
-    assert "rmse_test.png: not a PNG or GIF file" in said
+    notes = " ".join(run.notes)
+    assert "LFM" in notes
+    assert "rmse_test.png: not a PNG or GIF file" in notes
     assert "<svg" not in to_html(run)
 
 
@@ -87,8 +87,8 @@ def test_results_of_another_schema_or_program_are_refused(tmp_path):
     assert "not results of a comparison" in one_line(tmp_path)
 
 
-def test_a_zero_of_the_encoders_that_is_no_number_is_refused(tmp_path):
-    """Though the checksum matches."""
+def test_encoder_offset_that_is_no_number_is_refused(tmp_path):
+    """Although the checksum matches."""
     content = results()
     for of in content["models"]["LFM"]["test"].values():
         of["zero"] = "off"
@@ -96,7 +96,7 @@ def test_a_zero_of_the_encoders_that_is_no_number_is_refused(tmp_path):
     assert "not results of a comparison" in one_line(tmp_path)
 
 
-def test_not_a_number_is_no_json(tmp_path):
+def test_nan_is_not_valid_json(tmp_path):
     write(tmp_path)
     path = tmp_path / "results.json"
     path.write_text(path.read_text().replace("0.1", "NaN", 1))

@@ -1,10 +1,10 @@
-"""Feed every loader damaged files: it must give something valid or refuse by a documented error.
+"""Feed damaged files to every loader: it must return something valid or raise a documented error.
 
     python -m tests.robustness.fuzz --cases 100000 csv rig_json
 
-Runs from the repository's root. Loaders run in a child process with a limit of memory, every case
-with a limit of time, so that a crash of a library and a hang are counted too. A case is told by
-its number alone: `--first 4711 --cases 1 --keep case.csv` writes and repeats one.
+Run from the repository's root. Loaders run in a child process with a memory limit, every case with
+a time limit, so that a crash of a library and a hang are counted too. A case is identified by its
+number alone: `--first 4711 --cases 1 --keep case.csv` writes and repeats one.
 """
 
 from __future__ import annotations
@@ -38,24 +38,23 @@ from tests.robustness.loaders import LOADERS, Loader
 SECONDS, MEMORY = 5.0, 2 * 2**30
 _STUCK = 600.0  # wall time without progress [s]; a busy machine may well take a minute
 _HARNESS = 77  # exit status of a child that failed outside a case
-_PERISHED = 78  # and of one that an error of a library ends, as it ends a process of its own
+_PERISHED = 78  # and of one that a library error ends, as it ends a process of its own
 _MEMORY_DISK = "/dev/shm" if Path("/dev/shm").is_dir() else None
-_COUNTS = struct.Struct("qqq")  # the case at work, how many were loaded, how many refused
+_COUNTS = struct.Struct("qqq")  # the current case, how many were loaded, how many refused
 
 
 class Hang(BaseException):
-    """A case took too long; no loader's own `except` should take it."""
+    """A case took too long; derived so that no loader's own `except` catches it."""
 
 
 @dataclass
 class Outcome:
-    """What became of the cases of a loader.
+    """Results of the cases of a loader.
 
     Attributes:
-        loaded, refused: how many gave something valid, and a documented error.
-        perished: of what the refused ones had ended or hung a process of their own.
-        faults: by kind, where all else came from: number of cases, and the first of them with its
-            traceback.
+        loaded, refused: number of cases that gave something valid, or a documented error.
+        perished: what ended or hung the worker processes of refused cases.
+        faults: all other cases by kind: their number, and the first of them with its traceback.
     """
 
     loader: str
@@ -65,8 +64,8 @@ class Outcome:
     perished: Counter[str] = field(default_factory=Counter)
     faults: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
-    def add_fault(self, kind: str, case: int, told: str) -> None:
-        count, first, text = self.faults.get(kind, (0, case, told))
+    def add_fault(self, kind: str, case: int, description: str) -> None:
+        count, first, text = self.faults.get(kind, (0, case, description))
         self.faults[kind] = count + 1, first, text
 
     def __str__(self) -> str:
@@ -76,8 +75,8 @@ class Outcome:
             f"({self.seconds:.0f} s)"
         ]
         lines += [f"  apart, {kind}: {count} cases" for kind, count in self.perished.items()]
-        for kind, (count, first, told) in self.faults.items():
-            lines.append(f"  {kind}: {count} cases, first {first}\n{told}")
+        for kind, (count, first, description) in self.faults.items():
+            lines.append(f"  {kind}: {count} cases, first {first}\n{description}")
         return "\n".join(lines)
 
 
@@ -94,18 +93,18 @@ def fuzz(
     """Run a loader over damaged files.
 
     Args:
-        name: of `LOADERS`.
-        cases: how many, numbered from `first`.
-        seconds: of processor time that a case may take; what waits is ended after ten minutes.
-        memory: that the loader may take besides what this process has [bytes].
-        budget: no case is begun after this time [s].
-        keep: write the last case's file there.
+        name: key of `LOADERS`.
+        cases: number of cases, counted from `first`.
+        seconds: processor time per case [s]; a case that only waits is ended after ten minutes.
+        memory: memory of the loader in addition to that of this process [bytes].
+        budget: no case is started after this time [s].
+        keep: path for the last case's file.
     """
     outcome, begin = Outcome(name), time.monotonic()
     work = _Work(LOADERS[name], first + cases, seconds, memory, begin + budget, keep)
     at = first
     while at < work.end and time.monotonic() < work.deadline:
-        # Made here, as a child that is ended leaves its files behind.
+        # Created here, because a terminated child leaves its files behind.
         with tempfile.TemporaryDirectory(dir=_MEMORY_DISK) as folder:
             at = _run_child(work, at, outcome, Path(folder)) + 1
     outcome.seconds = time.monotonic() - begin
@@ -114,7 +113,7 @@ def fuzz(
 
 @dataclass(frozen=True)
 class _Work:
-    """What a child is to do: cases up to `end`, none begun after the deadline."""
+    """Task of a child: cases up to `end`, none started after the deadline."""
 
     loader: Loader
     end: int
@@ -125,7 +124,7 @@ class _Work:
 
 
 def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
-    """Cases from `first` on until all are done or one ends the child; the last case tried."""
+    """Run cases from `first` until all are done or one ends the child; return the last one."""
     shared = mmap.mmap(-1, _COUNTS.size)
     shared[:] = _COUNTS.pack(first, 0, 0)
     reader, writer = os.pipe()
@@ -134,7 +133,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
         os.close(reader)
         _child(work, first, shared, writer, folder)
     os.close(writer)
-    told = b""
+    output = b""
     last, since, hung = first, time.monotonic(), False
     while True:
         ready, _, _ = select.select([reader], [], [], 1.0)
@@ -142,7 +141,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
             part = os.read(reader, 1 << 16)
             if not part:
                 break
-            told += part
+            output += part
         case = _COUNTS.unpack(shared)[0]
         if case != last:
             last, since = case, time.monotonic()
@@ -155,12 +154,12 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     case, loaded, refused = _COUNTS.unpack(shared)
     outcome.loaded += loaded
     outcome.refused += refused
-    for line in told.decode().splitlines():
+    for line in output.decode().splitlines():
         outcome.add_fault(*json.loads(line))
     if status and os.WIFEXITED(status) and os.waitstatus_to_exitcode(status) == _HARNESS:
         raise RuntimeError(f"{work.loader.name}: the harness itself failed, see above.")
     if status:
-        ended = "hang in a library" if hung else f"the process ended ({_told(status)})"
+        ended = "hang in a library" if hung else f"the process ended ({_cause(status)})"
         if work.loader.apart:
             outcome.perished[ended] += 1
             outcome.refused += 1
@@ -169,7 +168,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     return int(case)
 
 
-def _told(status: int) -> str:
+def _cause(status: int) -> str:
     if os.WIFSIGNALED(status):
         return signal.Signals(os.WTERMSIG(status)).name
     if os.waitstatus_to_exitcode(status) == _PERISHED:
@@ -178,22 +177,22 @@ def _told(status: int) -> str:
 
 
 def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path) -> NoReturn:
-    """Never returns; tells faults as lines of JSON."""
+    """Write faults as lines of JSON, and never return."""
     loader = work.loader
     status = _HARNESS
     try:
         tempfile.tempdir = str(folder)
-        faulthandler.disable()  # what ends it is told by the parent
+        faulthandler.disable()  # the parent reports what ends it
         with _quiet(), os.fdopen(writer, "w") as pipe:
             samples = loader.samples(folder)
             warm = folder / f"warm{loader.suffix}"
             for sample in samples:  # libraries are imported before memory is limited
                 warm.write_bytes(sample)
                 loader.load(warm)
-            # What an address space already holds is no loader's.
+            # Memory in use before does not count for the loader.
             held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (held + work.memory,) * 2)
-            # A process of its own may be ended, where Python cannot interrupt it as well.
+            # A separate process may be terminated, even if Python cannot interrupt it.
             signal.signal(signal.SIGPROF, signal.SIG_DFL if loader.apart else _too_long)
             counts = [0, 0]
             case = first
@@ -203,7 +202,7 @@ def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path
                 if fault is not None:
                     pipe.write(json.dumps(fault) + "\n")
                     pipe.flush()
-                # Behind the case: however slow the machine, one is tried.
+                # After the case, so that one is tried even on a slow machine.
                 if time.monotonic() > work.deadline:
                     break
             shared[:] = _COUNTS.pack(case, *counts)
@@ -217,7 +216,7 @@ def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path
 def _try(
     work: _Work, case: int, samples: Sequence[bytes], folder: Path, counts: list[int]
 ) -> tuple[str, int, str] | None:
-    """One case: counted, or told as kind, number and traceback."""
+    """Run one case, which is counted, or reported as kind, number and traceback."""
     loader = work.loader
     rng = Random(f"{loader.name} {case}")
     content = loader.damage(rng, rng.choice(samples))
@@ -240,7 +239,7 @@ def _try(
         return None
     except (Exception, Hang) as error:
         if loader.apart and not isinstance(error, AssertionError):
-            os._exit(_PERISHED)  # as it would end there; it may have spoilt this process, too
+            os._exit(_PERISHED)  # as in a worker; it may have damaged this process, too
         frames = [
             f for f in traceback.extract_tb(error.__traceback__) if "/nfriction/" in f.filename
         ]
@@ -262,13 +261,13 @@ def _too_long(_signal: int, _frame: FrameType | None) -> None:
 def _quiet() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # A loader that computes with nonsense before it looks at it.
+        # A loader that computes with invalid numbers before it checks them.
         warnings.filterwarnings("error", category=RuntimeWarning, module=r"nfriction\.")
         yield
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status 1 where there is a fault."""
+    """Return exit status 1 if there is a fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("loaders", nargs="*", metavar="LOADER", help=", ".join(LOADERS))
     parser.add_argument("--cases", type=int, default=100_000)

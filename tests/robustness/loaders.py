@@ -1,7 +1,7 @@
-"""Every loader of foreign files: valid samples, how they are damaged, what it owes.
+"""All loaders of foreign files: valid samples, ways to damage them, required properties.
 
-`load` reads a file and checks laws of what came: finite, of one shape, and the same after a trip
-through our own writer. A loader may refuse by its documented errors alone.
+`load` reads a file and checks the result: finite, of consistent shape, and equal after a round
+trip through our own writer. A loader may raise only its documented errors.
 """
 
 from __future__ import annotations
@@ -69,14 +69,14 @@ class Loader:
     """A loader under test.
 
     Attributes:
-        suffix: of its files.
-        samples: valid files, made in a folder.
-        load: reads a file and checks it.
-        damage: how samples are changed.
-        refusals: what it may raise.
-        names_file: whether every refusal names the file.
-        needs: package without which it does not run.
-        apart: the library runs it in a process of its own; what ends or hangs that is a refusal.
+        suffix: suffix of its files.
+        samples: writer of valid files into a folder.
+        load: reader that checks its result.
+        damage: way in which samples are changed.
+        refusals: documented errors.
+        names_file: whether every error names the file.
+        needs: package that it requires.
+        apart: whether the library runs it in a separate process; its end or hang is a refusal.
     """
 
     name: str
@@ -215,7 +215,7 @@ def _matlab_7_3(path: Path) -> bytes:
 
 
 def _damage_hdf5(rng: Random, content: bytes) -> bytes:
-    """Bytes, or one more thing in the file that its own library wrote."""
+    """Damage the bytes, or add another object written by the file's own library."""
     if rng.random() < 0.7:
         return damage_bytes(rng, content)
     import h5py
@@ -262,7 +262,7 @@ def _damage_hdf5(rng: Random, content: bytes) -> bytes:
 
 
 def _damage_parquet(rng: Random, content: bytes) -> bytes:
-    """Bytes, or another table with odd types and what pandas is told of it."""
+    """Damage the bytes, or write another table with unusual types and pandas metadata."""
     if rng.random() < 0.7:
         return damage_bytes(rng, content)
     import pyarrow as pa
@@ -301,7 +301,7 @@ def _mdf_samples(folder: Path) -> list[bytes]:
 
 
 def _as_a_worker(library: str) -> Callable[[Path], None]:
-    """Read a file as a worker process does; whatever the library raises ends that process."""
+    """Read a file as a worker process does; any error of the library ends that process."""
 
     def load(path: Path) -> None:
         folder = path.parent / "read"
@@ -355,8 +355,8 @@ _MJCF = b"""<mujoco model="bench"><option gravity="0 0 -9.7"/><compiler angle="d
 
 def _read_rig(path: Path) -> None:
     plant = rigs.read(path)
-    said = plant.to_dict()
-    assert rigs.from_dict(said).to_dict() == said
+    entries = plant.to_dict()
+    assert rigs.from_dict(entries).to_dict() == entries
     q = torch.zeros(plant.joints, dtype=torch.float64)
     assert plant.mass_matrix(q).shape == (plant.joints, plant.joints)
     assert all(bool(b.isfinite().all()) for b in plant.buffers())
@@ -444,7 +444,7 @@ def _model_samples(folder: Path) -> list[bytes]:
 
 
 def _damage_model(rng: Random, content: bytes) -> bytes:
-    """With a checksum that fits mostly, as one who forges it would write."""
+    """Mostly with a valid checksum, as a forger would write it."""
     damaged = damage_json(rng, content)
     try:
         document = json.loads(damaged)
@@ -469,7 +469,7 @@ def _read_model(path: Path) -> None:
 def _contract_samples(_: Path) -> list[bytes]:
     model, info = _models()[0]
     found = contract_of(model, controller_of(model, info), info).to_dict()
-    # A few vectors say what many do, and quicker.
+    # A few vectors test the same as many, and faster.
     for side in found["vectors"].values():
         for name in side:
             side[name] = side[name][:4]
@@ -494,7 +494,7 @@ def _damage_artefact(rng: Random, content: bytes) -> bytes:
 
 
 def _damage_part(rng: Random, content: bytes) -> bytes:
-    """One file of an archive, mostly so that it is still JSON if it was."""
+    """Damage one file of an archive, mostly so that JSON remains JSON."""
     if content[:1] == b"{" and rng.random() < 0.8:
         with contextlib.suppress(ValueError, RecursionError):  # damaged before
             return damage_json(rng, content)
@@ -502,7 +502,7 @@ def _damage_part(rng: Random, content: bytes) -> bytes:
 
 
 def _read_archive(write: Callable[..., Path], path: Path) -> None:
-    """As `verify_artefact` does before torch runs anything."""
+    """Read as `verify_artefact` does before torch runs anything."""
     contract = contract_of_archive(path)
     assert contract.state_size >= 0
     with zipfile.ZipFile(own_program(path, _artefact(write))) as archive:
@@ -524,13 +524,13 @@ def _run_samples(folder: Path) -> list[bytes]:
 
 
 def _read_results(path: Path) -> None:
-    """A run whose results are damaged; its models are files of their own, see "model"."""
+    """Read a run with damaged results; its models are separate files, see "model"."""
     folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
     content = path.read_bytes()
     (folder / "results.json").write_bytes(content)
     run = read_run(folder)
-    # A page takes ten times as long as reading.
+    # Writing a page takes ten times as long as reading.
     if zlib.crc32(content) % 10 == 0:
         page = to_html(run)
         assert "<script>document" not in page

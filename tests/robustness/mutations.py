@@ -1,4 +1,4 @@
-"""Damage to valid files, by chance but repeatable: bytes, text, JSON and archives."""
+"""Random but reproducible damage to valid files: bytes, text, JSON and archives."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _NUMBERS = ["nan", "inf", "-inf", "NaN", "Infinity", "1e999", "-1e308", "1e308",
 _TEXTS = ["", " ", "\0", "﻿", "é", "日本語", "😀", "‮", "a" * 300, "'", '"', '"""',
           "\n", "\r", ",", ";", "\t", "#", "=", "[", "]", "{", "}", "../../x", "/etc/passwd",
           "=cmd()", "%s%n", "__class__", "q1", "q9999", "time", "0"]  # fmt: skip
-# Long enough to find what is slow or endless, and rare, for they are slow to make.
+# Long enough to reveal slow or endless loading, and rare, because they are slow to generate.
 _LONG = ["9" * 5000, "a" * 70_000, "é" * 5000, "\n" * 5000, "1," * 5000]
 _TOKEN = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?|\w+|[^\w\s]|\s+")
 
 
 def damage_bytes(rng: Random, content: bytes) -> bytes:
-    """Flipped bits, cut, doubled, moved and overwritten parts."""
+    """Flipped bits; truncated, duplicated, moved and overwritten parts."""
     data = bytearray(content)
     for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
         size = len(data)
@@ -58,7 +58,7 @@ def damage_bytes(rng: Random, content: bytes) -> bytes:
 
 
 def damage_text(rng: Random, content: bytes) -> bytes:
-    """Numbers, words, signs and lines changed for others; at times bytes too."""
+    """Numbers, words, signs and lines exchanged for others; sometimes bytes too."""
     text = content.decode("utf-8", errors="replace")
     for _ in range(rng.choice((1, 1, 2, 3, 8))):
         text = (_damaged_token if rng.random() < 0.7 else _damaged_lines)(rng, text)
@@ -101,7 +101,7 @@ def _damaged_lines(rng: Random, text: str) -> str:
     return "".join(lines)
 
 
-# Spellings that json.dumps cannot write; put in place of a marker.
+# Spellings that json.dumps cannot write, inserted in place of a marker.
 _RAW = ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "9" * 400, "1e-400", "[" * 2000,
         '{"a":' * 2000, "[" * 900 + "]" * 900, "[[0]]", '"\\ud800"', '{"a":1,"a":2}', "-0",
         "1.0", "0.1e1", "{}", "", "01", "'a'", "//"]  # fmt: skip
@@ -113,7 +113,7 @@ _VALUES: list[Any] = [None, True, False, 0, 1, -1, 2, 3, 1001, 2**31, 2**63, 2**
 
 
 def damage_document(rng: Random, document: Any) -> str:
-    """JSON text of a document with nodes replaced, dropped, doubled, renamed, nested."""
+    """JSON text of a document with nodes replaced, dropped, duplicated, renamed, nested."""
     document = json.loads(json.dumps(document))
     raw: dict[str, str] = {}
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
@@ -149,13 +149,13 @@ def damage_document(rng: Random, document: Any) -> str:
     for marker, value in raw.items():
         text = text.replace(marker, value)
     if rng.random() < 0.05:
-        # A key that comes twice, which dictionaries cannot hold.
+        # A duplicate key, which dictionaries cannot represent.
         text = text.replace("{", '{"name": 1, "name": 2, ', 1)
     return text
 
 
 def damage_json(rng: Random, content: bytes) -> bytes:
-    """A JSON file: as a document mostly, else as text."""
+    """A JSON file, mostly damaged as a document, otherwise as text."""
     if rng.random() < 0.2:
         return damage_text(rng, content)
     text = damage_document(rng, json.loads(content))
@@ -183,7 +183,8 @@ _NAMES = ["../../evil.npy", "/tmp/evil.npy", "time.npy", "q.npy", "q", "conventi
 
 
 def damage_zip(rng: Random, content: bytes, damage: Mutation = damage_bytes) -> bytes:
-    """An archive whose check sums fit what it holds; at times the archive's own bytes."""
+    """An archive whose checksums match its contents; sometimes the archive's own bytes are
+    damaged."""
     if rng.random() < 0.3:
         return damage_bytes(rng, content)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -209,7 +210,7 @@ def damage_zip(rng: Random, content: bytes, damage: Mutation = damage_bytes) -> 
 
 
 def damage_npy(rng: Random, content: bytes) -> bytes:
-    """An array file: its header as text, which tells type and shape, else its bytes."""
+    """An array file: its header as text, which defines type and shape, otherwise its bytes."""
     if rng.random() < 0.5 or not content.startswith(b"\x93NUMPY"):
         return damage_bytes(rng, content)
     size = struct.unpack_from("<H", content, 8)[0]
@@ -229,5 +230,5 @@ def damage_npy(rng: Random, content: bytes) -> bytes:
 
 
 def repacked(data: bytes) -> bytes:
-    """Data as zlib packs them."""
+    """Data compressed by zlib."""
     return zlib.compress(data, 1)

@@ -1,4 +1,4 @@
-"""A full disk, a read-only folder: an error that says where and what to do, and no half a file."""
+"""A full disk or read-only folder: errors state where and what to do, and leave no partial file."""
 
 import errno
 import os
@@ -45,7 +45,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 @contextmanager
 def full_disk(room: int) -> Iterator[None]:
-    """No file grows beyond `room` bytes, as where a disk has no more."""
+    """Limit every file to `room` bytes, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
@@ -57,7 +57,7 @@ def full_disk(room: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_where_there_is_no_room_the_old_file_stays(name: str, tmp_path: Path) -> None:
+def test_full_disk_keeps_the_old_file(name: str, tmp_path: Path) -> None:
     if name.endswith("parquet"):
         pytest.importorskip("pyarrow")
     path = tmp_path / name
@@ -70,7 +70,7 @@ def test_where_there_is_no_room_the_old_file_stays(name: str, tmp_path: Path) ->
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-def test_the_error_says_where_and_what_to_do(tmp_path: Path) -> None:
+def test_error_names_the_path_and_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     with full_disk(100), pytest.raises(OSError, match=f"make room in {tmp_path}") as refusal:
         save(LFM(3), path, INFO)
@@ -93,7 +93,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("name", ["model.json", "model.pt", "run.csv", "run.npz"])
-def test_a_disk_that_is_really_full(name: str, tiny_disk: Path) -> None:
+def test_full_file_system_keeps_the_old_file(name: str, tiny_disk: Path) -> None:
     (tiny_disk / "ballast").write_bytes(bytes(64 * 1024))
     with pytest.raises(OSError, match=r"No space left.*make room in") as refusal:
         WRITERS[name](tiny_disk / name)
@@ -101,7 +101,7 @@ def test_a_disk_that_is_really_full(name: str, tiny_disk: Path) -> None:
     assert [p.name for p in tiny_disk.iterdir()] == ["ballast"]
 
 
-def test_a_folder_that_is_read_only(tmp_path: Path) -> None:
+def test_read_only_folder_raises_a_clear_error(tmp_path: Path) -> None:
     folder = tmp_path / "locked"
     folder.mkdir()
     folder.chmod(0o500)
@@ -120,7 +120,7 @@ def read_only_disk(tiny_disk: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["model.json", "model.pt", "run.csv"])
-def test_a_disk_that_is_read_only(name: str, read_only_disk: Path) -> None:
+def test_read_only_file_system_raises_a_clear_error(name: str, read_only_disk: Path) -> None:
     with pytest.raises(OSError, match=r"Read-only.*allow writing to") as refusal:
         WRITERS[name](read_only_disk / name)
     assert refusal.value.errno == errno.EROFS
@@ -137,7 +137,7 @@ def test_a_disk_that_is_read_only(name: str, read_only_disk: Path) -> None:
     ],
     ids=["export", "demo", "train"],
 )  # fmt: skip
-def test_commands_say_it_in_a_line(words: list[str], tiny_disk: Path, tmp_path: Path) -> None:
+def test_commands_report_it_in_one_line(words: list[str], tiny_disk: Path, tmp_path: Path) -> None:
     model = save(LFM(3), tmp_path / "model.json", INFO)
     (tiny_disk / "ballast").write_bytes(bytes(56 * 1024))
     words = [word.format(disk=tiny_disk, model=model) for word in words]
@@ -152,7 +152,7 @@ def test_commands_say_it_in_a_line(words: list[str], tiny_disk: Path, tmp_path: 
     assert not [p for p in tiny_disk.rglob("*") if p.suffix == ".part"]
 
 
-def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
+def test_failed_block_leaves_no_file(tmp_path: Path) -> None:
     path = tmp_path / "a" / "file"
 
     def fail() -> None:
@@ -165,7 +165,7 @@ def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert not list(path.parent.iterdir())
 
 
-def test_a_new_file_has_the_rights_that_the_user_grants(tmp_path: Path) -> None:
+def test_new_files_have_the_users_default_permissions(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_atomically(tmp_path / "file", b"x")

@@ -19,7 +19,7 @@ from nfriction.recording import Recording, read_initial_states
 from tests.robustness.fuzz import fuzz
 from tests.robustness.loaders import LOADERS, Loader
 
-# An ONNX graph is written anew in each case, which takes a second, and a .pt2 for the first.
+# An ONNX graph is written again in each case, which takes a second, and a .pt2 in the first.
 QUICK = [name for name in LOADERS if name not in ("onnx", "pt2")]
 
 
@@ -31,7 +31,7 @@ def needed(name: str) -> Loader:
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_damaged_files_are_loaded_soundly_or_refused(name: str) -> None:
+def test_damaged_files_give_valid_objects_or_are_refused(name: str) -> None:
     needed(name)
     outcome = fuzz(name, 200, budget=1.0)
     assert not outcome.faults, str(outcome)
@@ -40,14 +40,14 @@ def test_damaged_files_are_loaded_soundly_or_refused(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOADERS)
-def test_many_damaged_files_are_loaded_soundly_or_refused(name: str) -> None:
+def test_many_damaged_files_give_valid_objects_or_are_refused(name: str) -> None:
     needed(name)
     outcome = fuzz(name, 10_000, first=10_000_000, budget=60.0)
     assert not outcome.faults, str(outcome)
 
 
-def test_the_harness_sees_what_it_looks_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loader that fails in every way is found out in every way."""
+def test_harness_detects_every_kind_of_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every way in which a loader can fail is detected."""
 
     def load(path: Path) -> None:
         content = path.read_bytes()
@@ -70,13 +70,13 @@ def test_the_harness_sees_what_it_looks_for(monkeypatch: pytest.MonkeyPatch) -> 
     )  # fmt: skip
     monkeypatch.setitem(LOADERS, "broken", broken)
     outcome = fuzz("broken", 40, seconds=0.05, memory=2**28)
-    told = " ".join(outcome.faults)
+    faults = " ".join(outcome.faults)
     for kind in ("Hang", "MemoryError", "KeyError", "without the file's name", "SIGABRT"):
-        assert kind in told
+        assert kind in faults
     assert outcome.loaded + outcome.refused + sum(n for n, *_ in outcome.faults.values()) == 40
 
 
-def test_what_perishes_in_a_process_of_its_own_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_in_a_worker_process_is_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(path: Path) -> None:
         content = path.read_bytes()
         if content == b"crash":
@@ -121,7 +121,7 @@ def test_what_perishes_in_a_process_of_its_own_is_refused(monkeypatch: pytest.Mo
         "\xff",
     ],
 )
-def test_rigs_that_are_none(text: str, tmp_path: Path) -> None:
+def test_invalid_rigs_are_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "rig.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ValueError, match=r"rig\.json") as refusal:
@@ -134,14 +134,14 @@ def test_rigs_that_are_none(text: str, tmp_path: Path) -> None:
     [
         # Seconds of counting each name among all.
         (",".join(f"c{k}" for k in range(20_000)) + "\n" + "1," * 20_000, "columns"),
-        # Rows longer than their header become an index of as many levels.
+        # Rows longer than their header become a multi-level index.
         ("time,q1\n" + "1," * 20_000, "columns"),
         ("x" * 70_000 + ",q1\n1,2\n", "time is missing"),
         # Finite, but no difference or square of it is.
         ("time,q1\n" + "\n".join(f"{k},{(-1) ** k * 1e308}" for k in range(9)), "within 1e"),
     ],
 )
-def test_recordings_that_are_none(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_recordings_are_refused(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"(?s)run\.csv.*{message}") as refusal:
@@ -149,8 +149,8 @@ def test_recordings_that_are_none(text: str, message: str, tmp_path: Path) -> No
     assert len(str(refusal.value)) < 5000
 
 
-def test_text_of_no_characters_is_refused(tmp_path: Path) -> None:
-    """NumPy makes a string of them that breaks the interpreter where it is next looked at."""
+def test_invalid_unicode_is_refused(tmp_path: Path) -> None:
+    """NumPy makes a string of them that crashes the interpreter on the next access."""
     path = tmp_path / "run.npz"
     arrays = {
         "time": np.arange(9.0) / 100,
@@ -167,7 +167,7 @@ def test_text_of_no_characters_is_refused(tmp_path: Path) -> None:
         Recording.read(path)
 
 
-def test_states_and_rules_name_their_file_and_are_brief(tmp_path: Path) -> None:
+def test_errors_of_states_and_rules_name_their_file_and_are_short(tmp_path: Path) -> None:
     path = tmp_path / "states.csv"
     path.write_text("id,q0_1,qd0_1\na,x,0\n")
     with pytest.raises(ValueError, match=r"states\.csv.*must be a number"):
@@ -184,7 +184,7 @@ def test_states_and_rules_name_their_file_and_are_brief(tmp_path: Path) -> None:
         assert len(str(refusal.value)) < 1000
 
 
-def test_what_unpacks_without_end_is_refused() -> None:
+def test_endless_decompression_is_refused() -> None:
     unpacked = 2 * files.UNSUSPECTED
     files.refuse_bomb(files.UNSUSPECTED, 1)
     files.refuse_bomb(unpacked, unpacked // files.LARGEST_RATIO + 1)

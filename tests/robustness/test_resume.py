@@ -1,4 +1,4 @@
-"""Runs that are killed or interrupted at any moment: what is resumed ends as if nobody had."""
+"""Runs that are killed or interrupted at any moment end with the result of an uninterrupted run."""
 
 import json
 import os
@@ -32,24 +32,24 @@ if __name__ == "__main__":
     ), jobs=1)
 """
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
-Told = Callable[[Path], None]
+Check = Callable[[Path], None]
 
 
 def begin(words: list[str]) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env=ENVIRONMENT, cwd=ROOT, start_new_session=True,
-        # Who runs the tests in the background has a shell that lets children ignore Ctrl-C.
+        # A shell in which the tests run in the background lets its children ignore Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
 
 
 def end(process: "subprocess.Popen[str]", how: int) -> str:
-    """What it said on standard error; its children end with it."""
+    """Standard error of a process that is ended together with its children."""
     if how == signal.SIGKILL:
         os.killpg(process.pid, how)
         return process.communicate()[1]
-    # A library's import may swallow a Ctrl-C; who pressed it presses again.
+    # A library's import may swallow a Ctrl-C; a user presses it again.
     for _ in range(10):
         process.send_signal(how)
         with suppress(subprocess.TimeoutExpired):
@@ -59,13 +59,13 @@ def end(process: "subprocess.Popen[str]", how: int) -> str:
 
 
 def broken_off(
-    words: list[str], folder: Path, started: Path, seed: int, kills: int, check: Told
+    words: list[str], folder: Path, started: Path, seed: int, kills: int, check: Check
 ) -> None:
-    """Run to the end, ended `kills` times on the way at moments drawn from the seed.
+    """Run to the end with `kills` terminations at random moments from the seed.
 
     Args:
-        started: a file that is there as soon as the work has begun.
-        check: what must hold of the folder after each end.
+        started: a file that exists as soon as the work has started.
+        check: condition that must be true of the folder after each termination.
     """
     rng = Random(seed)
     for kill in range(kills):
@@ -75,16 +75,16 @@ def broken_off(
         while not started.exists() and process.poll() is None:
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        # Importing takes most of the first seconds of every run but the first.
+        # In every run but the first, imports take most of the first seconds.
         time.sleep(rng.uniform(0.0, 1.5) + (0.0 if kill == 0 else rng.uniform(1.0, 4.0)))
         if process.poll() is None:
-            told = end(process, how)
+            messages = end(process, how)
             if how == signal.SIGINT and process.returncode:
-                assert process.returncode in (130, -signal.SIGINT), told
+                assert process.returncode in (130, -signal.SIGINT), messages
         check(folder)
     process = begin(words)
-    told = process.communicate(timeout=500)[1]
-    assert process.returncode == 0, told
+    messages = process.communicate(timeout=500)[1]
+    assert process.returncode == 0, messages
 
 
 def whole(words: list[str]) -> None:
@@ -93,7 +93,7 @@ def whole(words: list[str]) -> None:
 
 
 class Kept:
-    """Files that were finished stay as they are; a search never goes back."""
+    """Check that finished files do not change and a search never loses progress."""
 
     def __init__(self) -> None:
         self.finished: dict[Path, bytes] = {}
@@ -106,12 +106,12 @@ class Kept:
             assert path.read_bytes() == content, f"{path.name} was made anew"
         for path in files:
             if path.suffix == ".json":
-                json.loads(path.read_text())  # none is half of one
+                json.loads(path.read_text())  # no partial file
             if path.name.endswith("-search.json"):
                 state = SearchState(**json.loads(path.read_text())["result"])
                 assert state.evaluations >= self.evaluations
                 self.evaluations = state.evaluations
-            # The result is written anew by a run that only reads its stages.
+            # The result is written again by a run that only reads its stages.
             elif path.parent.name == "stages":
                 model = path.with_suffix(".json")
                 if model.exists():  # which is written last
@@ -120,7 +120,7 @@ class Kept:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("options", "seed"), [(SEARCH, 0), (SEARCH, 1), (STAGES, 2), (STAGES, 3)])
-def test_a_trainer_that_is_ended_again_and_again(
+def test_repeatedly_killed_trainer_gives_the_same_result(
     tmp_path: Path, options: list[str], seed: int
 ) -> None:
     words = [str(ROOT / "trainers" / options[0]), *options[1:], "--out"]
@@ -133,7 +133,7 @@ def test_a_trainer_that_is_ended_again_and_again(
 
 
 @pytest.mark.slow
-def test_a_reproduction_that_is_ended_again_and_again(tmp_path: Path) -> None:
+def test_repeatedly_killed_reproduction_gives_the_same_result(tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(REPRODUCE)
     whole([str(script), str(tmp_path / "whole")])
@@ -153,16 +153,16 @@ def test_a_reproduction_that_is_ended_again_and_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_with_what_was_reached_and_says_where(tmp_path: Path) -> None:
+def test_ctrl_c_saves_the_progress_and_names_the_folder(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = begin([str(ROOT / "trainers" / SEARCH[0]), *SEARCH[1:], "--out", str(folder)])
     state = folder / "checkpoints" / "stages" / "LFM-search.json"
     deadline = time.monotonic() + 200
     while not state.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
-    told = end(process, signal.SIGINT)
-    assert process.returncode == 130, told
-    assert f"progress is saved in {folder}" in told
-    assert "Traceback" not in told
+    messages = end(process, signal.SIGINT)
+    assert process.returncode == 130, messages
+    assert f"progress is saved in {folder}" in messages
+    assert "Traceback" not in messages
     assert state.exists()
     assert not [p for p in folder.rglob("*") if p.suffix == ".part"]

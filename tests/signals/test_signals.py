@@ -1,4 +1,4 @@
-"""Signals against known motions: error of every method, causality, frequency response, limits."""
+"""Signals of known motions: error of every method, causality, frequency response, limits."""
 
 import math
 import time as clock
@@ -43,7 +43,7 @@ def decay(time: np.ndarray) -> Motion:
 
 
 def savitzky_golay(time: np.ndarray, q: np.ndarray, window_s: float = 0.06) -> Motion:
-    """Local polynomials of order 4 on uniform samples, to compare with."""
+    """Local polynomials of order 4 on uniform samples, for comparison."""
     step = float(np.median(np.diff(time)))
     window = 2 * round(window_s / (2 * step)) + 1
     return Motion(
@@ -61,7 +61,7 @@ IRREGULAR = UNIFORM + np.random.default_rng(5).uniform(-2e-4, 2e-4, UNIFORM.shap
 
 
 def rmse(found: np.ndarray, truth: np.ndarray) -> float:
-    """Over all joints, the ends of 0.2 s apart."""
+    """RMSE over all joints without the ends of 0.2 s."""
     return float(np.sqrt(np.mean((found - truth)[200:-200] ** 2)))
 
 
@@ -74,16 +74,16 @@ def errors(method: str, truth: Motion) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_the_smoother_beats_the_causal_way_by_far(motion: str) -> None:
+def test_smoother_is_far_better_than_the_causal_filter(motion: str) -> None:
     truth = MOTIONS[motion](UNIFORM)
     causal, smooth = errors("causal", truth), errors("kalman", truth)
-    # The causal way is late by about 20 ms; the smoother is not.
+    # The causal filter is late by about 20 ms; the smoother is not.
     assert smooth[0] < causal[0] / 20
     assert smooth[1] < causal[1] / 5
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_causal_error_is_the_filters_delay(motion: str) -> None:
+def test_causal_error_is_the_delay_of_the_filter(motion: str) -> None:
     truth = MOTIONS[motion](UNIFORM)
     delay = math.sqrt(2) / (2 * math.pi * 20.0)  # of a Butterworth filter of 20 Hz at low frequency
     jerk = np.gradient(truth.qdd, 1e-3, axis=0)
@@ -95,7 +95,7 @@ def test_causal_error_is_the_filters_delay(motion: str) -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_kalman_smoother_finds_a_good_bandwidth(motion: str) -> None:
-    """It knows nothing of the motion and yet rivals the best of many Savitzky-Golay windows."""
+    """Without knowledge of the motion it rivals the best of many Savitzky-Golay windows."""
     truth = MOTIONS[motion](UNIFORM)
     q = quantise(truth.q, COUNTS)
     tried = [savitzky_golay(truth.time, q, window) for window in np.arange(0.02, 0.2, 0.01)]
@@ -106,18 +106,18 @@ def test_kalman_smoother_finds_a_good_bandwidth(motion: str) -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("method", METHODS)
-def test_irregular_stamps_cost_next_to_nothing(motion: str, method: str) -> None:
+def test_irregular_time_stamps_hardly_increase_the_error(motion: str, method: str) -> None:
     even = errors(method, MOTIONS[motion](UNIFORM))
     jittered = errors(method, MOTIONS[motion](IRREGULAR))
-    # Quantisation falls differently, so the two errors are alike, not equal. The causal filter
-    # runs at the nominal step, and the difference of velocities over a short step is noisier.
+    # Quantisation differs, so the two errors are similar, not equal. The causal filter runs at the
+    # nominal step, and the difference of velocities over a short step is noisier.
     limit = 1.6 if method == "causal" else 1.25
     assert jittered[0] < limit * even[0]
     assert jittered[1] < limit * even[1]
 
 
 def test_irregular_path_equals_the_uniform_one() -> None:
-    """A jitter just above the tolerance switches the path and hardly moves a sample."""
+    """A jitter just above the tolerance switches the code path and hardly moves a sample."""
     truth = sines(UNIFORM[:2000])
     nudged = truth.time.copy()
     nudged[1000] += 5e-6
@@ -128,13 +128,13 @@ def test_irregular_path_equals_the_uniform_one() -> None:
     # 5 µs at up to 10 rad/s are 5e-5 rad, a fraction of the noise, in one sample of thousands.
     assert np.abs(fast.qd - exact.qd).max() < 2e-3
     assert np.abs(fast.qdd - exact.qdd).max() < 0.5
-    # Far from that sample nothing is left of it.
+    # Far from that sample the effect has vanished.
     assert np.abs(fast.qdd - exact.qdd)[:500].max() < 1e-6
 
 
 @pytest.mark.parametrize("time", [UNIFORM[:400], IRREGULAR[:400]], ids=["uniform", "irregular"])
-def test_the_smoother_leaves_a_cubic_as_it_is(time: np.ndarray) -> None:
-    """The constant-jerk model contains every cubic, ends too."""
+def test_smoother_reproduces_cubics_exactly(time: np.ndarray) -> None:
+    """The constant-jerk model contains every cubic, including the ends."""
     s = time[:, None]
     q = 0.3 - 2 * s + 5 * s**2 - 4 * s**3
     found = kalman_smoother(time, q, noise=1e-4, jerk_density=1e2)
@@ -155,12 +155,12 @@ def test_quantise_is_nearest_and_idempotent(q: float, counts: int) -> None:
 
 
 @pytest.mark.parametrize("speed", [-3.1, -0.2, 0.05, 0.9, 40.0])
-def test_period_counting_of_a_steady_turn(speed: float) -> None:
+def test_period_counting_of_a_constant_rotation(speed: float) -> None:
     time = np.arange(4000) * 1e-3
     q = quantise(speed * time[:, None] + 0.01, COUNTS)
     found = period_counting(time, q, COUNTS)[1000:, 0]
-    # An edge is known to one sample: between edges that lie a time T apart the speed is off by at
-    # most a share 1 ms / T; faster than a count a sample, by a count in 1 ms.
+    # An edge is known to one sample: between edges that are a time T apart the speed error is at
+    # most a share 1 ms / T; faster than a count per sample, it is a count in 1 ms.
     share = 1e-3 * abs(speed) / QUANTUM
     assert np.abs(found - speed).max() <= abs(speed) * share / max(1 - share, 0.5) + (
         QUANTUM / 1e-3 if share > 0.5 else 1e-12
@@ -174,7 +174,7 @@ def test_period_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
     found = period_counting(time, quantise(moving, COUNTS), COUNTS)[:, 0]
     rest = time > 1.1
     assert np.all(np.diff(found[rest]) < 0)
-    # No edge for t seconds: at most one count in that time; the last edge lies at most at 1 s.
+    # No edge for t seconds: at most one count in that time; the last edge is at most at 1 s.
     assert np.all(found[rest] <= QUANTUM / (time[rest] - 1.0) * (1 + 1e-12))
     dither = QUANTUM * (np.arange(3000) % 2)[:, None]
     assert np.all(period_counting(time, dither, COUNTS)[2:] == 0)
@@ -183,7 +183,7 @@ def test_period_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
 # --- the causal way --------------------------------------------------------------------------
 
 
-def test_causal_motion_does_not_see_the_future() -> None:
+def test_causal_motion_does_not_depend_on_future_samples() -> None:
     truth = sines(UNIFORM[:3000])
     q = quantise(truth.q, COUNTS)
     other = q.copy()
@@ -206,22 +206,22 @@ def response(low_pass: SecondOrderLowPass, frequency_hz: float) -> float:
 @pytest.mark.parametrize("sample_time", [1e-3, 4e-3])
 @pytest.mark.parametrize("cutoff", [2.0, 20.0, 100.0])
 def test_cut_off_is_at_minus_three_decibels(cutoff: float, sample_time: float) -> None:
-    # Ten seconds hold whole periods: the transient is gone and nothing leaks.
+    # Ten seconds contain whole periods: the transient has decayed and there is no leakage.
     gain = response(SecondOrderLowPass(cutoff, sample_time), cutoff)
     assert gain == pytest.approx(math.sqrt(0.5), rel=1e-3)
     damped = response(SecondOrderLowPass(cutoff, sample_time, damping=1.0), cutoff)
     assert damped == pytest.approx(0.5, rel=1e-3)
 
 
-def test_low_pass_falls_with_the_second_power() -> None:
+def test_low_pass_is_of_second_order() -> None:
     low_pass = SecondOrderLowPass(1.0, 1e-3)
     assert response(low_pass, 20.0) / response(low_pass, 40.0) == pytest.approx(4, rel=0.03)
     assert response(low_pass, 0.05) == pytest.approx(1, rel=1e-4)
 
 
-def test_low_pass_at_rest_stays() -> None:
+def test_low_pass_at_rest_stays_at_rest() -> None:
     low_pass = SecondOrderLowPass(15.0, 1e-3)
-    # Rounding, kept by poles close to 1.
+    # Rounding, preserved by poles close to 1.
     np.testing.assert_allclose(low_pass(np.full((1000, 2), 3.7)), 3.7, rtol=1e-11)
     with pytest.raises(ValueError, match=r"half the sampling frequency \(500 Hz\), got 600"):
         SecondOrderLowPass(600.0, 1e-3)
@@ -232,8 +232,8 @@ def test_low_pass_at_rest_stays() -> None:
 # --- Kalman smoother -------------------------------------------------------------------------
 
 
-def test_standard_deviations_are_right_where_the_model_is() -> None:
-    """On motion drawn from the model itself, with its parameters given."""
+def test_standard_deviations_are_correct_for_the_true_model() -> None:
+    """For motion sampled from the model itself, with its parameters given."""
     rng = np.random.default_rng(11)
     step, n, joints, noise, density = 1e-3, 4000, 12, 3e-4, 1e8
     power = np.arange(4)
@@ -258,9 +258,10 @@ def test_standard_deviations_are_right_where_the_model_is() -> None:
     assert found.std is not None
     for k, key in enumerate(("q", "qd", "qdd")):
         score = (getattr(found, key) - state[:, k]) / getattr(found.std, key)
-        # Errors stay alike over about 20 samples: some 2,400 independent ones, 1.5 % of spread.
+        # Errors are correlated over about 20 samples: about 2,400 independent ones, 1.5 % of
+        # spread.
         assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.06)
-    # The same parameters come out of the record when they are not given.
+    # The same parameters are estimated if they are not given.
     searched = kalman_smoother(np.arange(n) * step, measured)
     assert searched.std is not None
     ratio = searched.std.qdd[n // 2] / found.std.qdd[n // 2]
@@ -274,12 +275,12 @@ def test_standard_deviations_cover_the_error_of_quantised_motion(motion: str) ->
     assert found.std is not None
     for key in ("q", "qd", "qdd"):
         score = np.abs(getattr(found, key) - getattr(truth, key)) / getattr(found.std, key)
-        # Real motion is smoother than the model: on the safe side, by less than a factor of 2.5.
+        # Real motion is smoother than the model: conservative by less than a factor of 2.5.
         assert 0.4 < np.sqrt(np.mean(score**2)) < 1.1
         assert 0.93 < np.mean(score < 2) <= 1.0
 
 
-def test_noise_is_found_or_taken() -> None:
+def test_noise_is_estimated_or_given() -> None:
     rng = np.random.default_rng(0)
     truth = sines(UNIFORM[:3000])
     sigma = np.array([1e-4, 1e-3, 5e-3])
@@ -290,11 +291,11 @@ def test_noise_is_found_or_taken() -> None:
     assert found.std is not None
     mean_std = found.std.qd.mean(axis=0)
     assert mean_std[0] < mean_std[1] < mean_std[2]
-    # More noise, less certain; a more restless jerk, less certain too.
+    # More noise or jerk gives a larger uncertainty.
     pairs = [(1e-3, 1e6), (2e-3, 1e6), (1e-3, 1e7)]
     stds = [kalman_smoother(truth.time, truth.q, *pair).std.qd.mean() for pair in pairs]  # type: ignore[union-attr]
     assert stds[0] < min(stds[1:])
-    # Either of the two may be given alone; the other then comes from the record.
+    # Either of the two may be given alone; the other is then estimated.
     for option in ({"noise": sigma}, {"jerk_density": 1e7}):
         alone = kalman_smoother(truth.time, measured, **option)  # type: ignore[arg-type]
         assert np.all(np.sqrt(np.mean((alone.q - truth.q) ** 2, axis=0)) < 0.5 * sigma)
@@ -304,7 +305,7 @@ def test_noise_is_found_or_taken() -> None:
 
 @pytest.mark.parametrize("gap", [0.3, 10.0, 1e5])
 @pytest.mark.parametrize("cut", [3, 1500, 2990])
-def test_a_gap_parts_a_record_and_spoils_neither_side(gap: float, cut: int) -> None:
+def test_gap_separates_a_recording_without_edge_errors(gap: float, cut: int) -> None:
     time = UNIFORM[:3000].copy()
     time[cut:] += gap
     truth = sines(time)
@@ -313,19 +314,20 @@ def test_a_gap_parts_a_record_and_spoils_neither_side(gap: float, cut: int) -> N
     assert found.std is not None
     for key in ("q", "qd", "qdd"):
         score = np.abs(getattr(found, key) - getattr(truth, key)) / getattr(found.std, key)
-        # The largest of 9000 normal deviations is about 4; three samples alone are very unsure.
+        # The largest of 9000 normal deviations is about 4; three samples alone are very uncertain.
         assert score.max() < 6
     if cut == 1500:
         halves = [kalman_smoother(time[k : k + 1500], measured[k : k + 1500]) for k in (0, 1500)]
         apart = np.concatenate([half.qdd for half in halves])
-        # Only the noise ratio, found from all of it, differs, and what the gap still tells.
+        # Only the noise ratio, estimated from all of it, differs, and the information across the
+        # gap.
         assert rmse(found.qdd, truth.qdd) < 1.2 * rmse(apart, truth.qdd)
 
 
 @pytest.mark.parametrize("counter", [1e-6, 1e-7])
 @pytest.mark.filterwarnings("error")
-def test_stamps_rounded_to_a_slow_clock_spoil_no_number(counter: float) -> None:
-    """Ten stamps of a clock of 10 ms, told apart by a counter: tiny steps, then a huge one."""
+def test_time_stamps_of_a_coarse_clock_keep_results_finite(counter: float) -> None:
+    """Ten stamps of a 10 ms clock, separated by a counter: tiny steps, then a huge one."""
     group, place = np.divmod(np.arange(500), 10)
     time = group / 100 + counter * place
     for q in (1e-3 * np.random.default_rng(0).normal(size=500), np.sin(group / 20)):
@@ -358,7 +360,7 @@ def test_smoothers_agree_on_a_real_triple_pendulum(data_dir: Path) -> None:
     recording = Recording.read(data_dir / "multiarm_pendulum" / "triple_b0.csv.gz")
     smooth = kalman_smoother(recording.time, recording.q)
     local = savitzky_golay(recording.time, recording.q)
-    # Both beside the residual noise of 2-5e-5 rad that the card tells.
+    # Both are close to the residual noise of 2-5e-5 rad of the data card.
     assert 1e-5 < rmse(smooth.q, recording.q) < 6e-5
     assert rmse(smooth.qd, local.qd) < 0.01
     assert smooth.std is not None
@@ -387,7 +389,7 @@ def test_bad_settings_are_refused() -> None:
         quantise(q, math.inf)
 
 
-def test_a_count_is_seen_where_changes_repeat():
+def test_encoder_resolution_is_estimated_from_repeated_steps():
     time = np.arange(0.0, 4.0, 1e-3)
     smooth = np.stack([np.sin(time), np.exp(-time) * np.cos(9 * time)], -1)
     assert np.isnan(count_seen(smooth)).all()
@@ -396,7 +398,7 @@ def test_a_count_is_seen_where_changes_repeat():
     assert np.isnan(count_seen((60 * time - 2.5 * time**2)[:, None])).all()
     read = quantise(smooth, 8192)
     quantum = 2 * np.pi / 8192
-    # Turned into other coordinates and back, or written with few digits.
+    # Converted to other coordinates and back, or written with few digits.
     for q in (read, np.pi + (read - np.pi), read.round(5)):
         np.testing.assert_allclose(count_seen(q), quantum, rtol=0.02)
     # A joint that never stops changes by dozens of counts at once.
@@ -415,17 +417,17 @@ def test_frequency_counting_resolves_a_count_over_its_interval(interval: float) 
         assert np.abs(found - speed).max() <= resolution * (1 + 1e-6)
         np.testing.assert_allclose(found / resolution, np.rint(found / resolution), atol=1e-6)
         assert found.mean() == pytest.approx(speed, rel=0.02)
-    # Slower than that it jumps between zero and one count; edges that are timed do not.
+    # Slower than that it jumps between zero and one count; period counting does not.
     assert set(np.rint(found / resolution)) == {0.0, 1.0}
     timed = period_counting(time, speed * time[:, None], COUNTS)[1000:, 0]
     assert np.abs(timed - speed).max() < 0.1 * np.abs(found - speed).max()
 
 
 @pytest.mark.parametrize("times", [0.2, 0.7, 1.4, 10.0])
-def test_period_counting_is_better_below_the_speed_of_equal_resolution(times: float) -> None:
+def test_period_counting_is_better_below_the_crossover_speed(times: float) -> None:
     """Their resolutions, counts per interval and v² sample / count, are equal at one speed."""
     time, sample, interval = np.arange(8000) / 1000, 1e-3, 0.01
-    # One speed alone may fit a whole number of counts into the interval.
+    # A single speed may fit a whole number of counts into the interval.
     speeds = times * QUANTUM / math.sqrt(sample * interval) * np.linspace(0.8, 1.2, 81)
     q = time[:, None] * speeds
     by_edges = period_counting(time, q, COUNTS)

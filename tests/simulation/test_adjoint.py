@@ -1,4 +1,4 @@
-"""Gradients of rollouts: the adjoint pass gives what recording every step gives."""
+"""Gradients of rollouts: the adjoint pass equals differentiation of recorded steps."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def neurofuzzy() -> NFLFM:
-    """A network that bends the coefficients, away from the kinks of its inputs' range."""
+    """A network with motion-dependent coefficients, away from the kinks of its inputs' range."""
     model = NFLFM(2, [2e-3, 1e-3], v_smooth=0.5, terms=(3, 2), head_units=3)
     for seed, p in enumerate(model.parameters()):
         p.data.add_(0.1 * random(*p.shape, seed=seed))
@@ -29,7 +29,7 @@ def neurofuzzy() -> NFLFM:
 
 
 class Coupled(nn.Module):
-    """Friction of one's own whose coefficients follow the motion of every joint."""
+    """User-defined friction whose coefficients depend on the motion of every joint."""
 
     joints = 2
 
@@ -48,7 +48,7 @@ class Coupled(nn.Module):
 
 
 def gradients(plant, model, backend, q0=Q0, qd0=QD0, wanted=(), **settings) -> list[Tensor]:
-    """Of a sum over the whole motion that weighs every number apart."""
+    """Gradients of a sum over the whole motion with different weights for all numbers."""
     q0, qd0 = (x.detach().clone().requires_grad_() for x in (q0, qd0))
     out = rollout(
         plant, model, q0, qd0, **({"steps": STEPS} | settings), gradients=True, backend=backend
@@ -74,26 +74,26 @@ def assert_equal_gradients(plant, model, **settings) -> None:
 @pytest.mark.parametrize(
     "name", [*(n for n in model_names() if not n.startswith("A")), "user", None]
 )
-def test_every_model(name):
+def test_gradients_of_every_model_agree(name):
     model = Coupled() if name == "user" else name and model_by_name(name)(2, v_smooth=0.5)
     assert_equal_gradients(CHAIN, model)
 
 
-def test_a_single_link():
+def test_gradients_of_a_single_link_agree():
     model = NFLFM(1, [2e-3, 1e-3], v_smooth=0.5, terms=(3, 2), head_units=3)
     plant = PendulumChain([0.3], [0.2])
     assert_equal_gradients(plant, model, q0=Q0[:, :1], qd0=QD0[:, :1])
 
 
 @pytest.mark.parametrize("chunk", [1, 15, 10_000])
-def test_any_division_into_chunks(chunk, monkeypatch):
+def test_gradients_do_not_depend_on_the_chunks(chunk, monkeypatch):
     monkeypatch.setitem(adjoint.CHUNK, "cpu", chunk)
     assert_equal_gradients(CHAIN, neurofuzzy())
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_batches_substeps_torques_and_irregular_stamps(batch, substeps):
+def test_gradients_agree_with_batches_substeps_and_irregular_stamps(batch, substeps):
     tau = (0.02 * random(STEPS, 2, seed=9)).requires_grad_()
     q0 = Q0[0] if not batch else Q0.expand(*batch, 2)
     qd0 = QD0[0] if not batch else QD0.expand(*batch, 2)
@@ -105,13 +105,13 @@ def test_batches_substeps_torques_and_irregular_stamps(batch, substeps):
 
 
 @pytest.mark.parametrize("model", [neurofuzzy(), Coupled()])
-def test_a_measured_drive(model):
+def test_gradients_with_a_measured_drive_agree(model):
     measured = (random(STEPS, 2, seed=4), 10.0 * random(3, STEPS, 2, seed=5))
     assert_equal_gradients(CHAIN, model, drive="measured", measured=(
         measured[0].expand(3, -1, -1), measured[1]))  # fmt: skip
 
 
-def test_the_plants_own_terms():
+def test_gradients_of_plant_terms_agree():
     moment = CHAIN.gravity_moment.clone().requires_grad_()
     drag = torch.full((2,), 1e-3, dtype=F64, requires_grad=True)
     found, expected = (
@@ -126,8 +126,8 @@ def test_the_plants_own_terms():
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
 
 
-def test_what_reads_tensors_of_others_is_recorded():
-    """A tensor that no module owns cannot be seen by the adjoint pass, and must not be lost."""
+def test_models_with_external_tensors_are_recorded():
+    """A tensor that no module owns is invisible to the adjoint pass, and must not be lost."""
     viscous = torch.tensor(2e-3, dtype=F64, requires_grad=True)
 
     class Reading(Coupled):
@@ -138,13 +138,13 @@ def test_what_reads_tensors_of_others_is_recorded():
     assert_equal_gradients(CHAIN, Reading(), wanted=(viscous,))
 
 
-def test_a_memory_is_recorded():
+def test_models_with_hidden_state_are_recorded():
     model = model_by_name("ALFM")(2, v_smooth=0.5)
     assert_equal_gradients(CHAIN, model)
 
 
-def test_values_of_the_forward_pass_count():
-    """Parameters that an optimiser moved since then are refused, not differentiated."""
+def test_parameters_changed_after_the_forward_pass_are_refused():
+    """Parameters that an optimiser has changed since are refused, not differentiated."""
     model = neurofuzzy()
     out = rollout(CHAIN, model, Q0, QD0, steps=3)
     with torch.no_grad():
@@ -153,7 +153,7 @@ def test_values_of_the_forward_pass_count():
         out.q.sum().backward()
 
 
-def test_a_second_derivative_says_that_it_is_none():
+def test_second_derivatives_are_refused():
     q0 = Q0.clone().requires_grad_()
     out = rollout(CHAIN, neurofuzzy(), q0, QD0, steps=3)
     (first,) = torch.autograd.grad(out.q.square().sum(), q0, create_graph=True)
@@ -161,7 +161,7 @@ def test_a_second_derivative_says_that_it_is_none():
         first.sum().backward()
 
 
-def test_a_diverging_candidate_spoils_no_gradient():
+def test_diverging_candidate_does_not_affect_other_gradients():
     q0, qd0 = Q0[:1].repeat(2, 1), QD0[:1].repeat(2, 1)
     tau = torch.zeros(2, STEPS, 2, dtype=F64)
     tau[1, 5:] = 1e12
@@ -175,7 +175,7 @@ def test_a_diverging_candidate_spoils_no_gradient():
         torch.testing.assert_close(a.grad, b.grad, rtol=1e-9, atol=1e-15)
 
 
-def test_a_step_more_costs_few_operations():
+def test_each_step_costs_few_operations():
     """The reason for the adjoint pass: on small tensors the calls cost more than the arithmetic."""
 
     class Counter(TorchDispatchMode):

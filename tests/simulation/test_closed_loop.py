@@ -1,4 +1,4 @@
-"""Closed loops: the motion is that of a rollout, and encoders, delay and drives do as they say."""
+"""Closed loops: the motion equals a rollout's; encoders, delay and drives act as specified."""
 
 import math
 
@@ -24,7 +24,7 @@ def friction(kind: type = LFM) -> LFM:
 
 
 @pytest.mark.parametrize("kind", [LFM, ALFM])
-def test_a_closed_loop_is_the_rollout_of_its_torques(kind: type) -> None:
+def test_closed_loop_equals_the_rollout_of_its_torques(kind: type) -> None:
     found = control(PLANT, friction(kind), spring, START, 0 * START, steps=300)
     again = rollout(PLANT, friction(kind), START, 0 * START, found.tau)
     assert torch.equal(found.q, again.q)
@@ -39,7 +39,7 @@ def test_friction_with_memory_keeps_its_state_from_sample_to_sample() -> None:
     assert torch.equal(found.law_state, again.law_state)
 
 
-def test_a_batch_is_each_of_its_motions() -> None:
+def test_batch_equals_its_single_motions() -> None:
     starts = torch.stack([START, START + 0.1])
     together = control(PLANT, friction(), spring, starts, 0 * starts, steps=50)
     for k, start in enumerate(starts):
@@ -47,7 +47,7 @@ def test_a_batch_is_each_of_its_motions() -> None:
         torch.testing.assert_close(together.q[k], alone.q, rtol=0, atol=1e-12)
 
 
-def test_encoders_delay_and_drives() -> None:
+def test_encoders_delay_and_drives_act_as_specified() -> None:
     seen = []
 
     def controller(time: float, q: np.ndarray) -> np.ndarray:
@@ -65,7 +65,7 @@ def test_encoders_delay_and_drives() -> None:
     np.testing.assert_allclose(found.tau[:, 0].numpy(), [0.0, 0.0, *wanted], atol=1e-12)
 
 
-def test_what_diverges_is_lost_and_the_others_go_on() -> None:
+def test_diverging_motion_does_not_stop_the_others() -> None:
     starts = torch.stack([START, START])
 
     def controller(time: float, q: np.ndarray) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_what_diverges_is_lost_and_the_others_go_on() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.zeros(2), np.full(3, np.nan)])
-def test_a_torque_that_is_none_is_refused(bad: np.ndarray) -> None:
+def test_invalid_controller_output_is_refused(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="finite torques"):
         control(PLANT, None, lambda *_: bad, START, 0 * START, steps=3)
 
@@ -89,6 +89,6 @@ def test_a_torque_that_is_none_is_refused(bad: np.ndarray) -> None:
     "options",
     [{"counts": 0}, {"delay": -1}, {"delay": 1.5}, {"torque_limit": 0.0}, {"torque_bits": 8}],
 )
-def test_electronics_refuse_nonsense(options: dict) -> None:
+def test_invalid_electronics_are_refused(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         Electronics(**options)

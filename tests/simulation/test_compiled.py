@@ -1,4 +1,4 @@
-"""The cache of compiled rollouts: one structure compiles once, and never serves another."""
+"""The cache of compiled rollouts: a structure compiles once, and is never used for another."""
 
 import functools
 import sys
@@ -37,7 +37,7 @@ def compilations(monkeypatch):
 
 
 def both(model, plant=CHAIN, **settings):
-    """Compiled and eager end of a short run; they must agree."""
+    """Compiled and eager end of a short run, which must agree."""
     start = Q0[: plant.joints], QD0[: plant.joints]
     ends = [
         rollout(plant, model, *start, steps=40, gradients=False, backend=b, **settings).q
@@ -47,7 +47,7 @@ def both(model, plant=CHAIN, **settings):
     return ends[0]
 
 
-def test_one_structure_compiles_once_and_follows_its_values(compilations):
+def test_structure_compiles_once_and_uses_current_values(compilations):
     model = LFM(2, [1e-3, 2e-3], v_smooth=0.05)
     first = both(model)
     model.schedule.set_coefficients([2e-2, 1e-2])
@@ -56,19 +56,19 @@ def test_one_structure_compiles_once_and_follows_its_values(compilations):
     assert len(compilations) == 1
     assert not torch.allclose(first, changed, atol=1e-6)
     assert not torch.allclose(first, other, atol=1e-6)
-    # The first model's values are back, though another one came between.
+    # The first model's values are used again, although another was simulated in between.
     model.schedule.set_coefficients([1e-3, 2e-3])
     torch.testing.assert_close(both(model), first, rtol=0, atol=1e-15)
     assert len(compilations) == 1
 
 
-def test_replaced_buffers_are_honoured(compilations):
+def test_replaced_buffers_are_used(compilations):
     model = LFM(2, [1e-3, 2e-3], v_smooth=0.05)
     first = both(model)
     lighter = both(model, CHAIN.replace(gravity_moment=0.5 * CHAIN.gravity_moment))
     assert len(compilations) == 1
     assert not torch.allclose(first, lighter, atol=1e-4)
-    # Drag is left out of the code while it is zero, so it needs code of its own.
+    # Zero drag is omitted from the code, so nonzero drag needs separate code.
     both(model, CHAIN.replace(drag_quadratic=torch.tensor([0.5, 0.5], dtype=F64)))
     assert len(compilations) == 2
 
@@ -81,7 +81,7 @@ def scaled(qd, load, coefficients, v_smooth, factor):
     return factor * linear(qd, load, coefficients, v_smooth)
 
 
-def test_what_is_baked_in_recompiles(compilations):
+def test_changed_constants_recompile(compilations):
     def model(torque, v_smooth=0.05):
         law = Law("user", LINEAR.coefficients, torque)
         return FrictionModel(law, Constant(law, 2, [1e-2, 1e-2]), v_smooth)
@@ -105,7 +105,7 @@ GAINS.damping = 1e-2
 
 
 class Grease:
-    """Attributes that a law reads."""
+    """Attributes used by a law."""
 
     scale = 1.0
 
@@ -162,8 +162,11 @@ def by_class(grease):
 
 @pytest.mark.parametrize("comparable", [True, False])
 @pytest.mark.parametrize("case", ["global", "module", "closure", "attribute", "array", "class"])
-def test_constants_of_a_users_law_are_followed(case, comparable, compilations, monkeypatch, caplog):
-    """Wherever Python holds a constant, a changed one is simulated, and one put back is known."""
+def test_changed_constants_of_a_user_defined_law_are_used(
+    case, comparable, compilations, monkeypatch, caplog
+):
+    """Wherever Python stores a constant, a changed one is simulated, and a restored one is
+    recognised."""
     monkeypatch.setattr(Grease, "scale", 1.0)
     grease = Grease()
     if comparable:
@@ -184,7 +187,7 @@ def test_constants_of_a_users_law_are_followed(case, comparable, compilations, m
     change()
     after = both(model, LINK)
     assert not torch.allclose(before, after, rtol=0, atol=1e-5)
-    # A new model of the same law, too.
+    # Also for a new model of the same law.
     same = FrictionModel(law, Constant(law, 1, [1e-2, 1e-2]))
     torch.testing.assert_close(both(same, LINK), after, rtol=0, atol=1e-15)
     assert len(compilations) == 2
@@ -192,7 +195,7 @@ def test_constants_of_a_users_law_are_followed(case, comparable, compilations, m
     assert caplog.text.count("traced again in every call") == (not comparable)
 
 
-def test_tables_that_are_no_buffers_are_told_apart(compilations):
+def test_tables_that_are_no_buffers_are_distinguished(compilations):
     class Table(torch.nn.Module):
         joints = 2
 
@@ -218,14 +221,14 @@ def test_tables_that_are_no_buffers_are_told_apart(compilations):
     assert len(compilations) == 2
 
 
-def test_motion_dependent_models_of_different_terms_are_apart(compilations):
+def test_motion_dependent_models_with_other_terms_are_distinguished(compilations):
     both(NFLFM(2, terms=(2, 2), head_units=2))
     both(NFLFM(2, terms=(3, 2), head_units=2))
     both(NFLFM(2, terms=(2, 2), head_units=2, acceleration="signed"))
     assert len(compilations) == 3
 
 
-def test_old_structures_are_forgotten(compilations, monkeypatch):
+def test_old_structures_are_evicted(compilations, monkeypatch):
     monkeypatch.setattr(compiled, "KEPT", 1)
     both(LFM(2, v_smooth=0.1))
     both(LFM(2, v_smooth=0.2))
@@ -239,7 +242,7 @@ def test_the_error_lists_valid_backends():
         rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, backend="numba")
 
 
-def test_an_operation_without_scalar_form_falls_back_unless_asked_by_name(compilations, caplog):
+def test_operation_without_scalar_form_uses_the_eager_fallback(compilations, caplog):
     def torque(qd, load, coefficients, v_smooth):
         return coefficients[..., 0] * torch.special.i0(qd * 0.1) * torch.tanh(qd)
 
@@ -274,8 +277,8 @@ def test_single_precision_and_plain_objects_run_in_torch(compilations):
             rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="compiled")
 
 
-def test_a_batch_of_plants_runs(compilations):
-    """Buffers with a batch of their own broadcast against the states, compiled or not."""
+def test_batch_of_plants_is_simulated(compilations):
+    """Buffers with a batch dimension broadcast with the states, compiled or not."""
     factor = torch.tensor([0.5, 1.0], dtype=F64)[:, None]
     plant = CHAIN.replace(gravity_moment=factor * CHAIN.gravity_moment)
     together = both(LFM(2, v_smooth=0.05), plant)

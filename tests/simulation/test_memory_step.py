@@ -1,4 +1,4 @@
-"""Rollouts of friction with memory: order, stability, rest, energy, agreement of all executors."""
+"""Rollouts of friction with memory: order, stability, rest, energy, agreement of executors."""
 
 import math
 from dataclasses import replace
@@ -49,7 +49,7 @@ CLASSIC = [1.0, 0.5, 0.001, 1e5, math.sqrt(1e5), 0.4]
 
 
 class Pulled(nn.Module):
-    """A mass on a spring; the other end of the spring moves as `tau = SPRING * position`."""
+    """A mass on a spring, whose other end moves as `tau = SPRING * position`."""
 
     joints = 1
 
@@ -112,14 +112,14 @@ def solution(soft: bool) -> np.ndarray:
 
 
 def error(soft: bool, steps: int) -> float:
-    """Largest position error over a second with so many steps each 0.05 s."""
+    """Largest position error over one second with this number of steps per 0.05 s."""
     model = LuGre(2, SOFT if soft else STIFF).requires_grad_(False)
     run = rollout(CHAIN, model, Q0, REST, sample_time=0.05 / steps, steps=20 * steps)
     return float(np.abs(run.q[::steps].numpy() - solution(soft)).max())
 
 
 @pytest.mark.slow
-def test_a_contact_that_the_step_resolves_is_solved_to_second_order() -> None:
+def test_resolved_contact_is_solved_to_second_order() -> None:
     coarse, fine = error(True, 25), error(True, 100)
     assert fine < 1e-5
     assert coarse / fine > 10.0  # 16 in the limit
@@ -132,7 +132,7 @@ def test_a_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
     assert coarse / fine > 3.0
 
 
-# Contacts of LuGre are among the stiff ones, slips of many elements among the slow tests.
+# The stiff tests include LuGre contacts, the slow ones many slip elements.
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=[pytest.mark.slow] * (x in {"lugre", "elasto-plastic", "slip"}))
@@ -140,7 +140,7 @@ def test_a_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
 )  # fmt: skip
 def test_compiled_and_eager_steps_agree(name: str) -> None:
     model = models()[name]
-    # Rounding grows fast where contacts break away within a step.
+    # Rounding errors grow fast if contacts break away within a step.
     steps, apart = (30, 1e-8) if name == "stiff" else (120, 1e-10)
     q0 = Q0 + torch.tensor([[0.0, 0.1], [0.3, -0.2], [-1.0, 0.5], [0.1, 0.1]], dtype=F64)
     runs = [
@@ -155,7 +155,7 @@ def test_compiled_and_eager_steps_agree(name: str) -> None:
     torch.testing.assert_close(runs[0].q[2], alone.q, rtol=0, atol=apart)
 
 
-def test_a_motion_goes_on_from_its_state() -> None:
+def test_motion_continues_from_its_state() -> None:
     model = models()["lugre"]
     whole = rollout(CHAIN, model, Q0, REST, steps=400)
     assert whole.law_state is not None
@@ -168,8 +168,9 @@ def test_a_motion_goes_on_from_its_state() -> None:
     assert float((forgotten.q - whole.q[200:]).abs().max()) > 1e-4
 
 
-def test_a_stiff_contact_is_stable_where_an_explicit_step_is_not() -> None:
-    # A contact of 1e5 N m/rad on 0.01 kg m^2 swings at 500 Hz: an explicit step of 1 ms diverges.
+def test_stiff_contact_is_stable_unlike_with_an_explicit_step() -> None:
+    # A contact of 1e5 N m/rad on 0.01 kg m^2 oscillates at 500 Hz: an explicit step of 1 ms
+    # diverges.
     axis = LinearAxis(0.01)
     model = LuGre(1, [1.0, 0.5, 0.01, 1e5, 1.0, 0.1]).requires_grad_(False)
     push = torch.full((2000, 1), 0.9, dtype=F64)
@@ -184,7 +185,7 @@ def test_a_stiff_contact_is_stable_where_an_explicit_step_is_not() -> None:
 
 
 @every_model
-def test_friction_never_feeds_energy_into_a_free_mechanism(name: str) -> None:
+def test_friction_does_not_inject_energy_into_a_free_mechanism(name: str) -> None:
     model = models()[name]
     run = rollout(CHAIN, model, Q0, REST, sample_time=1e-3, steps=10_000)
     kinetic, potential = CHAIN.energy(run.q, run.qd)
@@ -201,7 +202,7 @@ def test_friction_never_feeds_energy_into_a_free_mechanism(name: str) -> None:
 
 
 @pytest.mark.parametrize("offset", [0.1, -0.1, -2e-8])
-def test_a_torque_that_cancels_an_offset_leaves_the_motion_as_it_is(offset: float) -> None:
+def test_torque_that_cancels_an_offset_does_not_change_the_motion(offset: float) -> None:
     def motion(offset: float) -> Tensor:
         model = Slip(1).requires_grad_(False)
         c = model.schedule.parameter_vector().clone()
@@ -214,8 +215,8 @@ def test_a_torque_that_cancels_an_offset_leaves_the_motion_as_it_is(offset: floa
     torch.testing.assert_close(motion(offset), motion(0.0), rtol=0, atol=1e-9)
 
 
-def test_friction_that_falls_over_the_first_displacement_keeps_the_order() -> None:
-    """A law of one's own may have a negative narrow element, whose slope at rest is negative."""
+def test_friction_that_falls_with_displacement_keeps_the_order() -> None:
+    """A user-defined law may have a negative narrow element, whose slope at rest is negative."""
     signed = tuple(replace(c, positive=False) if c.linear else c for c in SLIP.coefficients)
     law = replace(SLIP, coefficients=signed)
     values = [0.0] * (FIRST + 2 * ELEMENTS)
@@ -231,8 +232,9 @@ def test_friction_that_falls_over_the_first_displacement_keeps_the_order() -> No
     assert float((coarse - fine).abs().max()) < 2e-4
 
 
-def test_a_joint_holds_on_a_slope_without_creep() -> None:
-    # A minute at 0.9 of breakaway; friction with a smoothed sign lets go of 0.9 of its velocity.
+def test_joint_on_a_slope_does_not_creep() -> None:
+    # One minute at 0.9 of breakaway; with a smoothed sign the joint would creep at 0.9 of its
+    # width.
     axis = LinearAxis(2.0)
     push = torch.full((60_000, 1), 0.9, dtype=F64)
     start = torch.zeros(1, dtype=F64)
@@ -257,7 +259,7 @@ def stick_slip(step: float, seconds: float = 40.0) -> tuple[np.ndarray, np.ndarr
 
 
 def period(time: np.ndarray, velocity: np.ndarray) -> float:
-    """Mean time between slips, by the rises through the pull's velocity."""
+    """Mean time between slips, detected by upward crossings of the pull's velocity."""
     k = np.flatnonzero((velocity[:-1] < PULL) & (velocity[1:] >= PULL))
     share = (PULL - velocity[k]) / (velocity[k + 1] - velocity[k])
     crossings = time[k] + share * (time[k + 1] - time[k])
@@ -266,7 +268,7 @@ def period(time: np.ndarray, velocity: np.ndarray) -> float:
 
 
 @pytest.mark.slow
-def test_the_stick_slip_cycle_has_the_period_of_the_published_equations() -> None:
+def test_stick_slip_period_equals_that_of_the_published_equations() -> None:
     f_c, f_d, v_s, stiffness, damping, viscous = CLASSIC
 
     def rate(t: float, y: np.ndarray) -> list[float]:
@@ -283,7 +285,7 @@ def test_the_stick_slip_cycle_has_the_period_of_the_published_equations() -> Non
 
 
 def breakaway(rate: float) -> float:
-    """Largest friction under a force on a mass of 1 kg that grows by so many N/s."""
+    """Largest friction of a 1 kg mass with a force that grows at this rate [N/s]."""
     count = round(2000.0 / min(rate, 2.0))
     step = 2.0 / rate / count
     push = (torch.arange(count, dtype=F64)[:, None] + 0.5) * step * rate
@@ -296,7 +298,7 @@ def breakaway(rate: float) -> float:
     return float(law.torque(run.law_state, run.qd, torch.ones_like(run.qd), c).max())
 
 
-def test_a_fast_load_breaks_a_contact_away_sooner() -> None:
+def test_breakaway_force_falls_with_the_force_rate() -> None:
     # Fig. 3 of Canudas de Wit et al.: from nearly F_s = 1.5 N down to nearly F_c = 1 N.
     slow, medium, fast = (breakaway(rate) for rate in (1.0, 10.0, 50.0))
     assert 1.35 < slow < 1.5
@@ -319,7 +321,7 @@ def test_friction_lags_behind_a_changing_velocity() -> None:
     assert float((up - down).max()) > 0.05
 
 
-def test_a_recording_is_scored_with_the_law_it_was_made_with() -> None:
+def test_true_law_with_memory_scores_well_on_its_recording() -> None:
     model = models()["lugre"]
     run = rollout(CHAIN, model, Q0, REST, sample_time=2e-3, steps=1000)
     recording = Recording(run.time.numpy(), run.q.numpy())
@@ -351,7 +353,7 @@ def test_gradients_reach_the_coefficients() -> None:
         assert float(found[j, k]) == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-4)
 
 
-def test_a_state_that_does_not_fit_is_refused() -> None:
+def test_state_of_wrong_shape_is_refused() -> None:
     model = models()["lugre"]
     with pytest.raises(ValueError, match=r"`law_state` must be finite \(\*batch, 2, 1\)"):
         rollout(CHAIN, model, Q0, REST, steps=3, law_state=torch.zeros(2))

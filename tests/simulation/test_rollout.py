@@ -1,4 +1,4 @@
-"""Rollouts: order, energy, passivity, agreement of all executors, gradients, honest errors."""
+"""Rollouts: order, energy, passivity, agreement of all executors, gradients, clear errors."""
 
 import logging
 import math
@@ -36,12 +36,13 @@ DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"), Coefficient("L", "N m s/r
 
 
 def smooth_model() -> FrictionModel:
-    """Friction without a steep passage, so that RK4 shows its order."""
+    """Friction without a steep transition, so that RK4 shows its order."""
     return LFM(2, [2e-3, 1e-3], v_smooth=2.0)
 
 
 def named_model(name: str) -> FrictionModel:
-    # A signed coefficient of zero would have no scale, and a network's offset move everything.
+    # A signed coefficient of zero would have no scale, and a network's offset would move
+    # everything.
     initial = [1e-3, 1e-3, 1e-3, 1e-3, 1.0] if name == "NFNLFM" else None
     model = model_by_name(name)(2, initial, v_smooth=0.05)
     generator = torch.Generator().manual_seed(3)
@@ -54,7 +55,7 @@ def named_model(name: str) -> FrictionModel:
             )
         model.schedule.set_classes([[30.0, 70.0], [40.0, 120.0]])
     elif not isinstance(model.schedule, Constant):
-        # A network that really bends the coefficients.
+        # A network with clearly motion-dependent coefficients.
         vector = model.schedule.parameter_vector()
         model.schedule.set_parameter_vector(
             0.1 * torch.randn(vector.shape, generator=generator, dtype=F64)
@@ -66,7 +67,7 @@ def run(model, q0=Q0, qd0=QD0, plant=CHAIN, **settings):
     return rollout(plant, model, q0, qd0, **({"gradients": False} | settings))
 
 
-# Laws of motion
+# Physical laws
 
 
 @pytest.mark.parametrize("friction", [False, True])
@@ -86,7 +87,7 @@ def test_order_of_convergence_is_four(friction):
     assert slopes == pytest.approx([4.0, 4.0], abs=0.25)
 
 
-def test_frictionless_energy_is_kept():
+def test_frictionless_energy_is_conserved():
     out = run(None, sample_time=1e-3, steps=2000)
     energy = sum(CHAIN.energy(out.q, out.qd))
     assert float((energy - energy[0]).abs().max()) < 1e-7 * float(energy.abs().max())
@@ -97,14 +98,14 @@ def test_passive_friction_never_adds_energy(name):
     model = named_model(name) if name != "NFNLFM" else model_by_name(name)(2, v_smooth=0.05)
     if name == "ANLFM":
         with torch.no_grad():
-            model.schedule.raw[..., 0] = 0.0  # f_o pushes, so it is no dissipation
+            model.schedule.raw[..., 0] = 0.0  # f_o pushes, so it is not dissipative
     out = run(model, *MOVING, sample_time=1e-3, steps=1000)
     energy = sum(CHAIN.energy(out.q, out.qd))
     assert float(energy.diff().max()) < 1e-9  # rounding and the integrator's own error
     assert float(energy[-1]) < float(energy[0]) - 1e-4
 
 
-def test_a_force_on_an_axis_against_the_closed_form():
+def test_force_on_an_axis_gives_the_closed_form():
     """m qdd = u - b qd from rest: qd = u/b (1 - exp(-b t / m))."""
     axis, b, u = LinearAxis(2.0), 3.0, 1.5
     model = model_by_name("NCFM")(1, [b])
@@ -117,7 +118,7 @@ def test_a_force_on_an_axis_against_the_closed_form():
 # Shapes, batches, options
 
 
-def test_shapes_times_and_the_first_acceleration():
+def test_shapes_times_and_first_acceleration_are_correct():
     out = run(smooth_model(), sample_time=2e-3, steps=10)
     assert out.q.shape == out.qd.shape == out.qdd.shape == (11, 2)
     torch.testing.assert_close(out.time, 2e-3 * torch.arange(11, dtype=F64))
@@ -143,7 +144,7 @@ def test_a_batch_equals_single_runs(backend):
 
 
 @pytest.mark.parametrize("backend", ["torch", "compiled"])
-def test_torques_or_steps_alone_may_bring_the_batch(backend):
+def test_batch_may_come_from_torques_or_steps_alone(backend):
     tau = torch.tensor([0.0, 0.01, 0.02], dtype=F64)[:, None, None].expand(3, 20, 2)
     out = run(smooth_model(), tau=tau, backend=backend)
     assert out.q.shape == (3, 21, 2)
@@ -172,12 +173,12 @@ def test_torch_and_compiled_code_agree(name):
         torch.testing.assert_close(
             getattr(compiled, field), getattr(eager, field), rtol=0, atol=1e-12
         )
-    # An acceleration is a velocity's difference over a step, and rounds as such.
+    # An acceleration is a velocity difference over a step, and has its rounding error.
     torch.testing.assert_close(compiled.qdd, eager.qdd, rtol=1e-10, atol=1e-9)
 
 
 def recorded(steps: int) -> dict:
-    """All that a recording of two runs may bring: torques, irregular stamps, a measured motion."""
+    """All possible data of two runs: torques, irregular stamps, a measured motion."""
     generator = torch.Generator().manual_seed(5)
 
     def random(*shape: int, scale: float) -> Tensor:
@@ -207,7 +208,7 @@ def test_torque_drag_irregular_stamps_and_a_measured_drive_agree(name):
 
 
 class Reads(TorchDispatchMode):
-    """Counts how often a tensor's value is asked for, which makes a GPU wait."""
+    """Counts how often a tensor's value is read, which makes a GPU wait."""
 
     def __init__(self):
         super().__init__()
@@ -220,9 +221,9 @@ class Reads(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", model_names())
-def test_no_value_is_asked_for_within_the_loop(name):
+def test_no_tensor_value_is_read_within_the_loop(name):
     counts = []
-    run(named_model(name), *MOVING, sample_time=5e-4, steps=2)  # bounds of the plant are kept
+    run(named_model(name), *MOVING, sample_time=5e-4, steps=2)  # bounds of the plant are cached
     for steps in (3, 9):
         with Reads() as reads:
             run(named_model(name), *MOVING, sample_time=5e-4, steps=steps, backend="torch")
@@ -233,7 +234,7 @@ def test_no_value_is_asked_for_within_the_loop(name):
 @pytest.mark.parametrize("backend", ["torch", "compiled"])
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 def test_substeps_are_finer_steps(backend, name):
-    """With coefficients held anew at every substep, substeps are nothing but shorter steps."""
+    """With coefficients evaluated at every substep, substeps are just shorter steps."""
     tau = 0.02 * torch.sin(torch.arange(40, dtype=F64))[:, None].expand(40, 2)
     fine = run(named_model(name), tau=tau.repeat_interleave(3, 0), sample_time=1e-3 / 3,
                backend=backend)  # fmt: skip
@@ -245,8 +246,8 @@ def test_substeps_are_finer_steps(backend, name):
 
 
 @pytest.mark.parametrize("backend", ["torch", "compiled"])
-def test_irregular_stamps_reach_the_same_place(backend):
-    """The motion belongs to time, not to samples: other stamps, same end."""
+def test_irregular_time_stamps_give_the_same_end(backend):
+    """The motion depends on time, not on samples: other stamps, same end."""
     generator = torch.Generator().manual_seed(1)
     step = 5e-4 + 1e-3 * torch.rand(150, generator=generator, dtype=F64)
     out = run(smooth_model(), sample_time=step, backend=backend)
@@ -255,7 +256,7 @@ def test_irregular_stamps_reach_the_same_place(backend):
     torch.testing.assert_close(out.q[-1], even.q[-1], rtol=0, atol=1e-9)
 
 
-def test_the_simulated_motion_as_measured_one_gives_itself():
+def test_simulated_motion_as_measured_drive_reproduces_itself():
     model = named_model("NFLFM")
     free = run(model, *MOVING, steps=60)
     measured = (free.qd[:-1], free.qdd[:-1])
@@ -268,8 +269,8 @@ def test_the_simulated_motion_as_measured_one_gives_itself():
 
 
 @pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
-def test_a_memory_advances_once_a_sample(backend):
-    """Substeps refine the integration; the class changes at samples only, as in a controller."""
+def test_hidden_state_advances_once_per_sample(backend):
+    """Substeps refine the integration; the class changes only at samples, as in a controller."""
     seen = []
 
     class Watched(Adaptive):
@@ -288,12 +289,12 @@ def test_a_memory_advances_once_a_sample(backend):
 
 
 @pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
-def test_a_motion_goes_on_with_what_it_remembers(backend):
-    """Cut in two with the memory handed over, a run is the uncut one."""
+def test_motion_continues_with_its_hidden_state(backend):
+    """A run in two parts with the hidden state handed over equals the uncut one."""
     model = named_model("ALFM")
     settings = {"sample_time": 5e-4, "backend": backend}
     whole = run(model, *MOVING, steps=400, **settings)
-    # The acceleration that a restart knows at first is another, so its class must not count.
+    # The acceleration at a restart differs at first, so its class must not count.
     states = model.schedule.states(whole.qd, whole.qdd)
     rest = run(model, whole.q[200], whole.qd[200], steps=200, hidden_state=states[200], **settings)
     torch.testing.assert_close(rest.q, whole.q[200:], rtol=0, atol=1e-12)
@@ -307,7 +308,7 @@ def test_a_motion_goes_on_with_what_it_remembers(backend):
 
 
 @pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
-def test_a_measured_motion_drives_the_memory_too(backend):
+def test_measured_motion_drives_the_hidden_state_too(backend):
     model = named_model("ALFM")
     settings = {"sample_time": 5e-4, "steps": 300, "backend": backend}
     free = run(model, *MOVING, **settings)
@@ -321,7 +322,7 @@ def test_a_measured_motion_drives_the_memory_too(backend):
     assert not torch.allclose(other.q, free.q, atol=1e-6)
 
 
-def test_a_memory_made_for_other_samples_fades_within_the_same_time():
+def test_hidden_state_of_another_rate_decays_in_the_same_time():
     model = named_model("ALFM")
     made = model.schedule.sample_time
     other = at_sample_time(model.schedule, 2e-3)
@@ -331,7 +332,7 @@ def test_a_memory_made_for_other_samples_fades_within_the_same_time():
     assert at_sample_time(model.schedule, 1.0001 * made) is model.schedule
 
 
-def test_a_batch_of_different_rates_needs_coefficients_without_memory():
+def test_different_rates_in_a_batch_need_memoryless_coefficients():
     steps = torch.tensor([[1e-3] * 5, [4e-3] * 5])
     with pytest.raises(ValueError, match=r"for a batch, got 0\.001 to 0\.004 s"):
         run(named_model("ALFM"), sample_time=steps)
@@ -339,7 +340,7 @@ def test_a_batch_of_different_rates_needs_coefficients_without_memory():
 
 
 @pytest.mark.parametrize("name", ["ALFM", "NFLFM"])
-def test_states_follow_the_time_of_samples(name):
+def test_hidden_states_use_the_time_stamps(name):
     model = named_model("ALFM")
     if name == "NFLFM":
         model = NFLFM(2, network="rbf", derivatives=2)
@@ -351,7 +352,7 @@ def test_states_follow_the_time_of_samples(name):
     assert not torch.allclose(model.schedule.states(qd, qdd), expected)
 
 
-def test_a_memory_must_fit_the_model():
+def test_hidden_state_must_match_the_model():
     with pytest.raises(ValueError, match="omit it"):
         run(smooth_model(), steps=2, hidden_state=torch.zeros(2, 2))
     for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
@@ -359,7 +360,7 @@ def test_a_memory_must_fit_the_model():
             run(named_model("ALFM"), steps=2, hidden_state=wrong)
 
 
-def test_gradients_reach_every_class_that_was_there():
+def test_gradients_reach_every_active_class():
     model = named_model("ALFM")
     out = rollout(CHAIN, model, *MOVING, sample_time=5e-4, steps=60)
     out.q.sum().backward()
@@ -381,7 +382,8 @@ def test_threads_change_nothing():
 
 @pytest.mark.parametrize("backend", ["torch", "compiled"])
 def test_divergence_is_reported_with_its_time(backend, caplog):
-    """Negative viscosity b feeds an axis: qd grows by exp(b/m t) and passes 1e6 at a known time."""
+    """Negative viscosity b accelerates an axis: qd grows by exp(b/m t) and passes 1e6 at a known
+    time."""
     explode = Law("explode", (Coefficient("b", "N s/m", positive=False),),
                   lambda qd, load, c, v_smooth: c[..., 0] * qd)  # fmt: skip
     model = FrictionModel(explode, Constant(explode, 1, [-100.0]), 1.0)
@@ -401,22 +403,22 @@ def test_divergence_is_reported_with_its_time(backend, caplog):
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_too_steep_friction_is_refused_and_the_message_mends_it(substeps):
+def test_too_steep_friction_is_refused_with_a_working_remedy(substeps):
     coefficients = [1e-3, 5e-2]
     model = LFM(2, coefficients, v_smooth=1e-3)
     with pytest.raises(ValueError, match="too steep") as caught:
         run(model, steps=5, substeps=substeps)
-    said = re.search(r"substeps=(\d+) or v_smooth >= (\S+)", str(caught.value))
-    assert said is not None
-    assert int(said[1]) == required_substeps(CHAIN, model, 1e-3) > substeps
-    run(model, steps=5, substeps=int(said[1]))
+    suggestion = re.search(r"substeps=(\d+) or v_smooth >= (\S+)", str(caught.value))
+    assert suggestion is not None
+    assert int(suggestion[1]) == required_substeps(CHAIN, model, 1e-3) > substeps
+    run(model, steps=5, substeps=int(suggestion[1]))
     with pytest.raises(ValueError, match="too steep"):
-        run(model, steps=5, substeps=int(said[1]) - 1)
-    run(LFM(2, coefficients, v_smooth=float(said[2])), steps=5, substeps=substeps)
+        run(model, steps=5, substeps=int(suggestion[1]) - 1)
+    run(LFM(2, coefficients, v_smooth=float(suggestion[2])), steps=5, substeps=substeps)
 
 
-def test_the_stability_limit_is_where_rk4_turns_unstable():
-    """An axis with viscous friction just below the limit dies out, just above it grows."""
+def test_stability_limit_is_that_of_rk4():
+    """Motion with viscous friction just below the limit decays, just above it grows."""
     axis = LinearAxis(0.5)
     limit = 0.5 * RK4_STABILITY / 1e-3
     assert required_substeps(axis, model_by_name("NCFM")(1, [limit]), 1e-3) == 1
@@ -449,7 +451,7 @@ def test_coupled_joints_are_limited_by_their_fastest_mode():
 # Gradients
 
 
-def test_gradients_of_a_short_rollout():
+def test_gradients_of_a_short_rollout_equal_finite_differences():
     model = smooth_model()
 
     def end(q0, qd0, raw):
@@ -485,7 +487,7 @@ def test_gradients_reach_the_parameters_of_model_and_plant():
     assert float(model.schedule.network.anfis.consequents.grad.abs().sum()) > 0
 
 
-def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
+def test_gradients_are_recorded_if_required_and_affordable(monkeypatch):
     monkeypatch.setattr("nfriction.simulation.adjoint.MOST_STEPS", 20)
     model = smooth_model()
     assert rollout(CHAIN, model, Q0, QD0, steps=20).q.requires_grad

@@ -1,4 +1,4 @@
-"""Friction that stops a joint and holds it."""
+"""Friction that stops a joint and keeps it at rest."""
 
 import math
 from itertools import pairwise
@@ -24,7 +24,7 @@ def slide(force: float, *, v0: float = 0.0, steps: int = 1000, **settings):
                    **{"scheme": "time_stepping", "gradients": False} | settings)  # fmt: skip
 
 
-def test_a_sliding_mass_stops_where_mechanics_says_and_stays():
+def test_sliding_mass_stops_at_the_predicted_place_and_stays():
     """v0^2 m / (2 F) = 0.16 m, after 0.8 s."""
     run = slide(0.0, v0=0.4, substeps=10)
     assert float(run.q[-1, 0]) == pytest.approx(0.4**2 * 4.0 / (2 * DRY), rel=1e-3)
@@ -37,11 +37,11 @@ def test_a_sliding_mass_stops_where_mechanics_says_and_stays():
 @pytest.mark.parametrize(
     ("force", "moved"), [(1.9, 0.0), (-1.9, 0.0), (2.5, 0.0625), (-2.5, -0.0625)]
 )
-def test_a_force_below_breakaway_moves_nothing(force, moved):
+def test_force_below_breakaway_causes_no_motion(force, moved):
     assert float(slide(force, substeps=10).q[-1, 0]) == pytest.approx(moved, abs=1e-5)
 
 
-def test_a_smooth_sign_creeps_where_it_ought_to_rest():
+def test_smooth_sign_creeps_instead_of_resting():
     model, plant = CVFM(1, [0.1, 1e-3], v_smooth=0.01), PendulumChain([0.5], [0.3])
     q0 = torch.tensor([math.pi + 0.05], dtype=F64)
     start = {"q0": q0, "qd0": torch.zeros(1, dtype=F64), "sample_time": 1e-3, "steps": 500}
@@ -52,7 +52,7 @@ def test_a_smooth_sign_creeps_where_it_ought_to_rest():
     assert float((crept.q[-1] - crept.q[0]).abs()) > 1e-3
 
 
-def test_two_joints_come_to_rest_and_lose_energy_all_the_way():
+def test_two_joints_come_to_rest_with_decreasing_energy():
     plant, model = pendulum(), LFM(2, [[4e-3, 6e-2], [2e-3, 2e-2]], v_smooth=0.01)
     q0, zero = torch.tensor([math.pi + 0.6, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
     run = rollout(plant, model, q0, zero, sample_time=1e-3, steps=4000, substeps=4,
@@ -60,11 +60,11 @@ def test_two_joints_come_to_rest_and_lose_energy_all_the_way():
     energy = sum(plant.energy(run.q, run.qd))
     assert float(energy.diff().max()) < 1e-5
     assert float(run.qd[-1].abs().max()) < 1e-5
-    # It rests where friction holds it, off its balance.
+    # Friction keeps it at rest away from equilibrium.
     assert float(plant.gravity(run.q[-1]).abs().max()) > 1e-3
 
 
-def test_shorter_steps_come_nearer_to_the_smooth_solution_while_joints_move():
+def test_steps_converge_to_the_smooth_solution_while_joints_move():
     plant, model = pendulum(), LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.01)
     q0, zero = torch.tensor([2.0, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
     settings = {"sample_time": 1e-3, "steps": 300, "gradients": False}
@@ -80,8 +80,8 @@ def test_shorter_steps_come_nearer_to_the_smooth_solution_while_joints_move():
 
 
 @pytest.mark.parametrize("torque", [0.0, 0.4])
-def test_gears_lose_what_they_lose_in_smooth_steps(torque):
-    """Driven, and back-driven by what swings against friction alone."""
+def test_gear_losses_equal_those_of_smooth_steps(torque):
+    """Driven, and back-driven by a swing against friction alone."""
     plant = pendulum(armature=[1e-3, 1e-3]).replace(
         gear_loss=torch.tensor([0.2, 0.4], dtype=F64)
     )  # fmt: skip
@@ -99,7 +99,7 @@ def test_gears_lose_what_they_lose_in_smooth_steps(torque):
     assert float((free - stopped).abs().max()) > 5 * off
 
 
-def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
+def test_eager_torch_is_used_if_compilation_fails(monkeypatch, caplog):
     fast = slide(2.5, v0=-0.1, steps=200)
 
     def refuse(*_, **__):
@@ -113,7 +113,7 @@ def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
     torch.testing.assert_close(eager.qd, fast.qd, rtol=0, atol=1e-12)
 
 
-def test_a_batch_is_its_members():
+def test_batch_equals_its_members():
     plant, model = pendulum(), LFM(2, [4e-3, 3e-2], v_smooth=0.01)
     q0 = torch.tensor([[2.0, 0.4], [3.0, -0.4], [3.5, 0.0]], dtype=F64)
     settings = {"sample_time": 1e-3, "steps": 50, "scheme": "time_stepping", "gradients": False}
@@ -124,7 +124,7 @@ def test_a_batch_is_its_members():
         torch.testing.assert_close(both.q[k], one.q, rtol=0, atol=1e-12)
 
 
-def test_what_it_cannot_do_is_refused():
+def test_unsupported_options_are_refused():
     with pytest.raises(ValueError, match=r"`scheme` must be one of .*got 'euler'"):
         slide(0.0, scheme="euler")
     with pytest.raises(ValueError, match="has no gradients"):
@@ -135,7 +135,7 @@ def test_what_it_cannot_do_is_refused():
 
 
 @pytest.mark.parametrize("compiles", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_it_warms_joints_as_the_smooth_scheme_does(compiles, monkeypatch):
+def test_heat_equals_that_of_the_smooth_scheme(compiles, monkeypatch):
     plant, start = pendulum(normal_load="bearing"), torch.tensor([2.0, 0.5], dtype=F64)
     given = {"sample_time": 2e-3, "steps": 1000 if compiles else 50, "gradients": False}
     smooth = rollout(plant, warming(), start, 0 * start, substeps=4, **given)
@@ -149,12 +149,12 @@ def test_it_warms_joints_as_the_smooth_scheme_does(compiles, monkeypatch):
     assert (later.q - found.q).abs().max() > (1e-2 if compiles else 1e-5)
 
 
-def test_a_score_may_take_it():
-    """Friction with a sign as sharp as here would take a hundred steps of the smooth scheme."""
+def test_score_accepts_the_scheme():
+    """A sign as sharp as this would need a hundred steps of the smooth scheme."""
     truth = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=0.02)
     recording = swing(pendulum(), truth, seconds=1.0)
     sharp = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=1e-6)
-    told = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="time_stepping")
-    assert np.isfinite(told.free_run.all)
-    assert told.free_run.all < 0.01
-    assert told.windows["0.5"].all < 0.01
+    scored = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="time_stepping")
+    assert np.isfinite(scored.free_run.all)
+    assert scored.free_run.all < 0.01
+    assert scored.windows["0.5"].all < 0.01

@@ -1,4 +1,4 @@
-"""The scripts that train: what they write, and that an interruption changes no result."""
+"""Training scripts: their output, and that an interruption changes no result."""
 
 import importlib
 import json
@@ -37,14 +37,14 @@ SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "2", "--model", "L
 
 @pytest.fixture(autouse=True)
 def same_interrupt() -> Iterator[None]:
-    """A trainer takes Ctrl-C for itself; the other tests want it back."""
+    """Restore the interrupt handler, which a trainer replaces, for the other tests."""
     before = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 def train(*words: object) -> None:
-    """Run a trainer within this process, which has torch loaded already."""
+    """Run a trainer within this process, in which torch is already loaded."""
     script, *others = map(str, words)
     sys.argv, before = [script], sys.argv
     try:
@@ -83,7 +83,7 @@ def test_every_offered_model_exists(script: str) -> None:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """A recording, in the folder of the file of its rig."""
+    """A recording, in the folder of its rig file."""
     rigs.write(PendulumChain([0.5], [0.4], [0.2], [0.01]), tmp_path / "rig.json")
     time = np.arange(400) / 200
     table = pd.DataFrame({"time": time, "q1": 3 + np.exp(-time) * np.cos(6 * time)})
@@ -107,7 +107,7 @@ def test_checkpoints_of_other_options_are_refused(log: Path) -> None:
 
 @pytest.mark.parametrize(("name", "old", "new"), [("run.csv", ",4.0", ",4.001"),
                                                   ("rig.json", "0.4", "0.5")])  # fmt: skip
-def test_checkpoints_of_a_file_that_has_changed_are_refused(
+def test_checkpoints_of_a_changed_file_are_refused(
     log: Path, name: str, old: str, new: str
 ) -> None:
     begin(log)
@@ -120,7 +120,7 @@ def test_checkpoints_of_a_file_that_has_changed_are_refused(
     begin(log, "--resume")
 
 
-def test_checkpoints_are_deleted_only_after_a_finished_run_and_for_good_data(log: Path) -> None:
+def test_checkpoints_are_deleted_only_after_a_finished_run(log: Path) -> None:
     begin(log)
     begin(log)  # no result is lost yet
     kept = log.with_name("checkpoints") / "stages" / "NLFM.json"
@@ -164,7 +164,7 @@ def test_columns_of_a_recording_are_named_as_in_fits(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data sets of these tests, built once; compiled models stay in the cache of all tests."""
+    """Data sets of these tests, built once; compiled models stay in the common cache."""
     return tmp_path_factory.mktemp("cache")
 
 
@@ -187,7 +187,7 @@ def test_networks_are_trained_on_the_supervised_set(
     train("train_supervised.py", *words)
     assert "3000 samples per joint, 3 units" in capsys.readouterr().out
     model = load(tmp_path / f"{made}.json")
-    # The network follows the controllers: it is not the constant that it started from.
+    # The network follows the controllers: it differs from its initial constant.
     speeds = torch.tensor([[0.1] * 3, [3.0] * 3], dtype=torch.float64)
     spread = model.schedule(speeds, torch.zeros_like(speeds)).diff(dim=0).abs()
     assert adaptive is not None or (spread > 0).all()
@@ -240,7 +240,7 @@ def test_a_negative_seed_is_refused_by_name(
     assert "argument --seed: must be a whole number from 0, got '-1'" in capsys.readouterr().err
 
 
-def test_networks_tolerate_noise_on_what_they_learn(
+def test_networks_tolerate_noise_on_their_targets(
     tmp_path: Path,
     cache: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -254,7 +254,7 @@ def test_networks_tolerate_noise_on_what_they_learn(
         printed = capsys.readouterr().out
         assert "1500 samples per joint" in printed
         worst[noise] = max(map(float, re.findall(r"\b[BC] ([\d.]+)", printed)))
-    # In % of the outputs' range: noise matters, but most of its 50 % is averaged out.
+    # In % of the outputs' range: noise has an effect, but most of its 50 % is averaged out.
     assert worst["0.001"] < 1.0 < worst["0.5"] < 10.0
 
 
@@ -279,7 +279,7 @@ def test_every_kind_of_model_is_trained(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: int) -> None:
+def test_interrupted_search_resumes_to_the_same_result(tmp_path: Path, how: int) -> None:
     train(*SEARCH, "--out", tmp_path / "whole")
     folder = tmp_path / "ended"
     words = [sys.executable, str(TRAINERS / SEARCH[0]), *SEARCH[1:], "--out", str(folder)]
@@ -298,7 +298,7 @@ def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: 
     assert load_info(folder / "LFM.json").fit == load_info(tmp_path / "whole" / "LFM.json").fit
 
 
-def test_a_law_without_an_adaptive_model_needs_another_procedure(tmp_path: Path) -> None:
+def test_law_without_an_adaptive_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="--procedure ours"):
         train("train_neurofuzzy.py", *QUICK, "--model", "NFStribeck", "--procedure", "papers",
               "--out", tmp_path)  # fmt: skip
@@ -314,7 +314,7 @@ def test_a_motion_too_short_for_the_table_is_refused(
 
 
 @pytest.mark.slow
-def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
+def test_network_adapts_online_to_falling_friction(tmp_path: Path) -> None:
     train("learn_online.py", "--seconds", "40", "--warming", "5", "--out", tmp_path)
     table = pd.read_csv(tmp_path / "drift.csv", index_col=0)
     assert (table["learning"].iloc[1:] < 0.8 * table["frozen"].iloc[1:]).all()
@@ -328,7 +328,7 @@ def test_written_rules_are_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_rules_evolve_to_a_front_and_go_on(
+def test_rules_evolve_to_a_front_and_resume(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["evolve_rules.py", *QUICK, "--model", "ANCFM", "--population", "5",
@@ -347,12 +347,12 @@ def test_rules_evolve_to_a_front_and_go_on(
 
 
 @pytest.mark.slow
-def test_rules_evolve_on_a_driven_rig_of_ones_own(tmp_path: Path) -> None:
-    """The torque of the drive is no friction, and there are no test recordings."""
+def test_rules_evolve_on_a_user_defined_driven_rig(tmp_path: Path) -> None:
+    """The drive's torque is not friction, and there are no test recordings."""
     plant = PendulumChain([0.5], [0.4], [0.2], [0.01])
     law = CVFM(1, [[0.05, 0.02]]).requires_grad_(False)
     time = np.arange(8000) / 1000
-    # Of growing size, so that the acceleration has classes.
+    # With growing amplitude, so that the acceleration has classes.
     tau = (0.1 + 0.08 * time) * np.sin(5 * time + np.sin(3 * time))
     tau = tau[:, None]
     zero = torch.zeros(1, dtype=torch.float64)

@@ -16,7 +16,7 @@ LOW, MEDIUM, HIGH = 0, 1, 2
 
 
 def schedule(joints: int = 1, **options) -> Adaptive:
-    """Coefficients that tell their class by their digits; thresholds at 10 and 100 rad/s^2."""
+    """Coefficients whose digits identify their class; thresholds at 10 and 100 rad/s^2."""
     table = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]], dtype=F64)
     made = Adaptive(LINEAR, joints, table.expand(joints, 3, 2), **options)
     made.set_classes([10.0, 100.0])
@@ -24,35 +24,35 @@ def schedule(joints: int = 1, **options) -> Adaptive:
 
 
 def stepped(made: Adaptive, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
-    """Memory after every sample, one `advance` after the other."""
+    """Hidden state after every sample by successive calls of `advance`."""
     return super(Adaptive, made).states(qd, qdd)
 
 
 @pytest.mark.parametrize(("size", "known"), [(0.0, LOW), (9.9, LOW), (10.1, MEDIUM), (101.0, HIGH)])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_the_class_is_where_the_acceleration_lies(size: float, known: int, sign: float) -> None:
+def test_class_contains_the_acceleration(size: float, known: int, sign: float) -> None:
     made, qd = schedule(), torch.zeros(1, dtype=F64)
     qdd = torch.tensor([sign * size], dtype=F64)
     expected = torch.tensor([[known + 1.0, 10.0 * (known + 1)]], dtype=F64)
     torch.testing.assert_close(made(qd, qdd).detach(), expected)
-    # Forward is the first sample.
+    # The first sample is reached forwards.
     state = made.initial_state(qd, qdd)
     assert torch.equal(made.coefficients_from(qd, qdd, state), made(qd, qdd))
 
 
-def test_fast_states_equal_stepped_ones() -> None:
+def test_vectorised_states_equal_stepped_ones() -> None:
     made = schedule(3, time_constant=0.02, sample_time=1e-3)
     made.set_classes([[3.0, 30.0], [10.0, 10.0], [1.0, 200.0]], [2.0, 0.0, 5.0])
     qd, qdd, _ = motion(2000, 3)
     qdd[300:700] *= 1e-3
     found, expected = made.states(qd, qdd), stepped(made, qd, qdd)
-    # A running maximum of logarithms rounds as its largest term does.
+    # A running maximum of logarithms rounds like its largest term.
     torch.testing.assert_close(found[..., 0], expected[..., 0], rtol=1e-11, atol=0)
     assert torch.equal(found[..., 1], expected[..., 1])
     assert set(found[..., 1].unique().tolist()) == {0.0, 1.0, 2.0}
 
 
-def test_a_peak_fades_with_the_time_constant() -> None:
+def test_peak_decays_with_the_time_constant() -> None:
     made = schedule(time_constant=0.5, sample_time=0.01)
     qdd = torch.zeros(101, 1, dtype=F64)
     qdd[0] = 90.0
@@ -62,11 +62,11 @@ def test_a_peak_fades_with_the_time_constant() -> None:
     torch.testing.assert_close(peak_envelope(qdd.abs(), made.fading)[:, 0], exact)
 
 
-def test_hysteresis_does_not_chatter_where_its_absence_does() -> None:
+def test_hysteresis_prevents_chatter() -> None:
     ripple = 10.0 + torch.sin(torch.arange(400, dtype=F64))[:, None]
     changes = {}
     for hysteresis in (0.0, 0.2):
-        # The memory is shorter than the ripple, so the envelope shows it whole.
+        # The memory is shorter than the ripple, so the envelope contains all of it.
         made = schedule(hysteresis=hysteresis, time_constant=1e-4)
         known = made.classes(torch.zeros_like(ripple), ripple)
         changes[hysteresis] = int((known[1:] != known[:-1]).sum())
@@ -83,7 +83,7 @@ def test_a_class_is_entered_above_and_left_below_its_threshold() -> None:
 
 
 @given(cut=st.integers(1, 299))
-def test_the_future_does_not_touch_the_present(cut: int) -> None:
+def test_classes_do_not_depend_on_future_samples(cut: int) -> None:
     made = schedule(2, time_constant=0.05)
     qd, qdd, _ = motion(300, 2)
     other = torch.cat([qdd[:cut], 1e3 * normal(300 - cut, 2, seed=9)])
@@ -91,7 +91,7 @@ def test_the_future_does_not_touch_the_present(cut: int) -> None:
     assert torch.equal(before[..., 1], after[..., 1])
 
 
-def test_one_wild_value_does_not_hold_the_class_for_long() -> None:
+def test_single_outlier_does_not_hold_the_class_for_long() -> None:
     made = schedule(time_constant=1.0, sample_time=1e-2)
     qdd = torch.full((400, 1), 1.0, dtype=F64)
     qdd[0] = torch.inf
@@ -100,7 +100,7 @@ def test_one_wild_value_does_not_hold_the_class_for_long() -> None:
     assert int((known == HIGH).sum()) == pytest.approx(157, abs=2)
 
 
-def test_a_lost_sample_leaves_the_memory_whole() -> None:
+def test_lost_sample_keeps_the_hidden_state() -> None:
     made, zero = schedule(), torch.zeros(1, dtype=F64)
     state = made.initial_state(zero, torch.tensor([50.0], dtype=F64))
     nan = torch.tensor([torch.nan], dtype=F64)
@@ -109,7 +109,7 @@ def test_a_lost_sample_leaves_the_memory_whole() -> None:
     assert torch.isfinite(made.initial_state(nan, nan)).all()
 
 
-def test_a_start_at_full_speed_is_known_by_the_swing_rate() -> None:
+def test_start_at_full_speed_is_classified_by_the_swing_rate() -> None:
     made = schedule()
     zero, fast = torch.zeros(1, dtype=F64), torch.tensor([8.0], dtype=F64)
     assert float(made.initial_state(fast, zero)[0, 1]) == LOW
@@ -129,7 +129,7 @@ def test_sensitivities_are_those_of_the_coefficients() -> None:
             made.set_parameter_vector(start + step)
             above = made(qd, qdd)
             made.set_parameter_vector(start - step)
-            slope = (above - made(qd, qdd)) / 2e-4  # exact but for rounding: linear
+            slope = (above - made(qd, qdd)) / 2e-4  # exact except for rounding: linear
             expected = torch.zeros(40, 2, 5, dtype=F64)
             expected[:, found.joint[p]] = found.parameters[..., p]
             torch.testing.assert_close(slope, expected, rtol=0, atol=1e-9)
@@ -137,7 +137,7 @@ def test_sensitivities_are_those_of_the_coefficients() -> None:
     assert not found.qdd.any()
 
 
-def test_names_follow_the_parameter_vector() -> None:
+def test_names_match_the_parameter_vector() -> None:
     made = schedule(2)
     names = made.parameter_names(["a", "b"])
     table = dict(zip(names, made.parameter_vector().tolist(), strict=True))
@@ -145,13 +145,13 @@ def test_names_follow_the_parameter_vector() -> None:
     assert table["B of a, high"] == pytest.approx(3.0)
 
 
-def test_every_class_counts_for_the_slope_at_rest() -> None:
+def test_damping_at_rest_includes_every_class() -> None:
     values = torch.tensor([[[0.0, 1e-3], [0.0, 9e-3], [0.0, 2e-3]]], dtype=F64)
     model = ALFM(1, values, v_smooth=0.1)
     assert float(model.zero_velocity_damping()) == pytest.approx(9e-3 / 0.1, rel=1e-6)
 
 
-def test_options_rebuild_the_memory() -> None:
+def test_options_restore_the_hidden_state() -> None:
     made = ALFM(2, hysteresis=0.1, time_constant=3.0, sample_time=2e-3)
     again = ALFM(2, **json.loads(json.dumps(made.schedule.options())))
     assert torch.equal(made.schedule.fading, again.schedule.fading)

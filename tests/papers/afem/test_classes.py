@@ -1,4 +1,4 @@
-"""Classes of acceleration are found where they are, and what lacks is said."""
+"""Acceleration classes are recovered, and missing data are named."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ JOINTS = ("a", "b")
 
 
 def swinging(*sections, seed=0, name="swing"):
-    """Motion of two joints whose accelerations swing with given sizes for given times [s]."""
+    """Motion of two joints whose accelerations have given amplitudes for given times [s]."""
     sizes = np.concatenate([np.full(round(t / STEP), size) for t, size in sections])
     time = STEP * np.arange(len(sizes))
     qdd = np.stack([sizes * np.sin(7.0 * time + seed), 0.5 * sizes * np.cos(9.0 * time)], -1)
@@ -31,7 +31,7 @@ def found_in(*pieces, **settings):
 DYING = ((6.0, 200.0), (8.0, 30.0), (16.0, 3.0))
 
 
-def test_a_dying_motion_goes_through_all_classes_in_time():
+def test_decaying_motion_passes_all_classes_in_time():
     recording, motion = swinging(*DYING)
     schedule, classes = found_in((recording, motion))
     assert classes.notes == ()
@@ -48,21 +48,21 @@ def test_a_dying_motion_goes_through_all_classes_in_time():
             if end > 0.3
         ]
         assert [known for known, _, _ in intervals] == ["high", "medium", "low"]
-        # The memory lets go within a few of its time constants, and never looks ahead.
+        # The memory decays within a few of its time constants, and never looks ahead.
         ends = [end for _, _, end in intervals]
         assert 6.0 <= ends[0] < 8.0
         assert 14.0 <= ends[1] < 16.0
     assert schedule.sample_time == pytest.approx(STEP)
 
 
-def test_given_intervals_are_taken_and_their_thresholds_tell_them_apart():
+def test_given_intervals_are_used_and_separated_by_their_thresholds():
     given = {"swing": {"a": [("high", 0, 7), ("medium", 7, 14), ("low", 14, 25)],
                        "b": [("low", 0, 1.3), ("high", 1.3, 6), ("low", 14, 30)]}}  # fmt: skip
     recording, motion = swinging(*DYING)
     schedule, classes = found_in((recording, motion), intervals=given)
     labels = classes.labels[0]
     at = {t: labels[round(t / STEP)].tolist() for t in (0.5, 5.0, 13.0, 29.0)}
-    # Outside every interval the nearest one holds.
+    # Outside every interval the nearest one applies.
     assert at == {0.5: [2, 0], 5.0: [2, 2], 13.0: [1, 0], 29.0: [0, 0]}
     known = schedule.classes(torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd))
     assert float((known[:, 0] == labels[:, 0]).double().mean()) > 0.9
@@ -81,7 +81,7 @@ def test_given_thresholds_are_kept():
     assert schedule.thresholds.tolist() == [[10.0, 100.0], [5.0, 50.0]]
 
 
-def test_a_class_with_little_data_takes_its_neighbours_coefficients():
+def test_class_with_little_data_uses_its_neighbours_coefficients():
     _, classes = found_in(swinging((0.2, 200.0), (10.0, 30.0), (10.0, 3.0)),
                           thresholds=[10.0, 60.0])  # fmt: skip
     assert classes.stands_for[0].tolist() == [0, 1, 2]
@@ -103,7 +103,7 @@ def test_sample_times_must_agree():
         found_in(swinging(*DYING), (other, still))
 
 
-def test_otsu_parts_three_heaps_between_them():
+def test_otsu_separates_three_clusters():
     random = np.random.default_rng(0)
     heaps = [random.normal(centre, 0.1, 500) for centre in (0.0, 1.0, 4.0)]
     low, high = otsu(np.concatenate(heaps))

@@ -1,4 +1,4 @@
-"""Adaptive fits recover coefficients by class and never serve worse than the constant law."""
+"""Adaptive fits recover coefficients by class and are never worse than the constant law."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ from nfriction.papers.afem.fit_adaptive import (
 from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
-from tests.fitting.test_trajectory import ABSOLUTE, point, windows
+from tests.fitting.test_shooting_problem import ABSOLUTE, point, windows
 
 V_SMOOTH = 0.05
 THRESHOLDS = [[30.0, 90.0], [60.0, 200.0]]
@@ -67,7 +67,7 @@ def test_coefficients_by_class_are_recovered(case):
     plant, _, held, _, constant = case
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fitted(case, model, classes=ClassOptions(THRESHOLDS, prior_sd=3.0))
-    # What matters of a class is its friction at the speeds that it has.
+    # A class is characterised by its friction at the speeds that it contains.
     true, speeds = torch.tensor(TRUTH, dtype=F64), torch.tensor([[2.0, 4.0, 8.0]] * 2, dtype=F64)
     for factor in (0.7, 1.4):
         ours, exact = (
@@ -83,7 +83,7 @@ def test_coefficients_by_class_are_recovered(case):
         assert mine < other
 
 
-def test_an_ordinary_fit_finds_the_classes_itself(case):
+def test_default_fit_finds_the_classes(case):
     plant, train, _, motions, constant = case
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fit(model, plant, train, fit_plant=False, windows=(1.0,), start=constant,
@@ -105,8 +105,8 @@ def test_searches_improve_on_the_constant_law_too(case, method):
     assert score(plant, model, held).free_run.all < score(plant, constant.model, held).free_run.all
 
 
-def test_without_a_difference_between_classes_the_constant_law_stays(case):
-    """A tight prior holds every class at the constant law; nothing may get worse."""
+def test_without_class_differences_the_constant_law_is_kept(case):
+    """A tight prior keeps every class at the constant law; nothing may get worse."""
     constant = case[-1]
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fitted(case, model, classes=ClassOptions(prior_sd=1e-6), max_steps=3)
@@ -115,7 +115,7 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
     assert found.residual <= constant.residual * (1 + 1e-9)
 
 
-def test_classes_that_only_fit_the_noise_are_not_taken():
+def test_classes_that_only_fit_noise_are_rejected():
     plant, truth = pendulum(), LFM(2, [3e-3, 4e-3], v_smooth=V_SMOOTH)
     train = [swing(plant, truth, start=start) for start in ((2.6, 0.2), (0.9, -0.5))]
     model = ALFM(2, v_smooth=V_SMOOTH)
@@ -124,7 +124,7 @@ def test_classes_that_only_fit_the_noise_are_not_taken():
     assert list(model.schedule.coefficient_sets()) == ["always"]
 
 
-def test_a_fit_that_is_stopped_keeps_the_constant_law(case):
+def test_stopped_fit_keeps_the_constant_law(case):
     plant, train, _, motions, constant = case
     found = fit_adaptive(ALFM(2), plant, train, start=constant, motions=motions,
                          callback=lambda name, step: True)  # fmt: skip
@@ -149,14 +149,14 @@ def test_a_stop_after_evidence_accepted_the_classes_keeps_them(case, monkeypatch
 
 
 @pytest.mark.parametrize(("of_class", "kept"), [(3.0, False), (-math.inf, True)])
-def test_a_prior_under_which_the_motion_diverges_is_not_chosen(case, monkeypatch, of_class, kept):
-    """The evidence of the constant law diverges too: differences would be no numbers."""
+def test_prior_with_diverging_motion_is_not_chosen(case, monkeypatch, of_class, kept):
+    """The evidence of the constant law diverges too: differences would not be numbers."""
     evidence = cycle([-math.inf, -math.inf, of_class, -math.inf, -math.inf, -math.inf])
     monkeypatch.setattr("nfriction.papers.afem.fit_adaptive.log_evidence", lambda _: next(evidence))
     assert ("gain too little" in fitted(case, max_steps=2).status) == kept
 
 
-def test_a_constant_law_that_is_kept_is_told_once_with_its_intervals_and_doubts(case):
+def test_kept_constant_law_is_reported_once_with_its_warnings(case):
     constant = replace(case[-1], unidentifiable=("B of joint1",))
     found = fit_adaptive(ALFM(2), *case[:2], start=constant, motions=case[3],
                          callback=lambda name, step: True)  # fmt: skip
@@ -169,7 +169,7 @@ def test_a_constant_law_that_is_kept_is_told_once_with_its_intervals_and_doubts(
     assert any("the constant law is kept" in warning for warning in found.warnings)
 
 
-def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
+def test_worse_coefficients_are_rejected(case, monkeypatch):
     constant = case[-1]
     monkeypatch.setattr("nfriction.papers.afem.fit_adaptive.PositionError.residuals",
                         lambda self, vector: torch.full((1, 1, 2), 1e9, dtype=F64))  # fmt: skip
@@ -182,7 +182,7 @@ def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
-def test_gradient_by_class_against_finite_differences(substeps):
+def test_gradient_by_class_equals_finite_differences(substeps):
     plant, model = pendulum(), ALFM(2, v_smooth=0.1)
     one = torch.ones(2, 2, dtype=F64)
     given = FrictionModel(model.law, GivenClasses(model, 4e-3 * one, 1e-3 * one), 0.1)
@@ -202,11 +202,11 @@ def test_gradient_by_class_against_finite_differences(substeps):
         step[i] = 1e-6
         slope = (p.cost(x + step) - p.cost(x - step)) / 2e-6
         assert float(gradient[i]) == pytest.approx(float(slope), rel=2e-4, abs=1e-2)
-    # Every class of both joints had a say.
+    # Every class of both joints contributed.
     assert (gradient[: p.variables.friction_count].abs() > 1e-6).all()
 
 
-def test_what_does_not_fit_is_refused(case):
+def test_inconsistent_input_is_refused(case):
     plant, train, _, _, _ = case
     with pytest.raises(ValueError, match="no adaptive model"):
         fit_adaptive(NFLFM(2), plant, train)

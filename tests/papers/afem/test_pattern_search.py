@@ -1,4 +1,4 @@
-"""Laws of the pattern search."""
+"""Properties of the pattern search."""
 
 import json
 import math
@@ -53,7 +53,7 @@ def rosenbrock(x: Tensor) -> Tensor:
 START = vector(2, 2, 2)
 
 
-def test_the_bottom_of_a_bowl_is_found() -> None:
+def test_minimum_of_a_quadratic_is_found() -> None:
     values: list[float] = []
     result = minimise(bowl, box(START, -3.0, 3.0), lambda at: values.append(at.value))
     assert result.converged
@@ -62,17 +62,17 @@ def test_the_bottom_of_a_bowl_is_found() -> None:
     assert values == sorted(values, reverse=True)
 
 
-def test_rosenbrock_is_followed_along_its_valley() -> None:
+def test_rosenbrock_is_minimised() -> None:
     result = minimise(rosenbrock, box(vector(-1.2, 1)), max_evaluations=50_000)
     assert result.converged
     torch.testing.assert_close(result.vector, vector(1, 1), rtol=0, atol=5e-3)
 
 
-def test_absolute_value_is_no_obstacle() -> None:
+def test_nonsmooth_function_is_minimised() -> None:
     target = vector(0.37, -1.21, 2.0)
     result = minimise(lambda x: (x - target).abs().sum(1), box(vector(0, 0, 0), -4.0, 4.0))
     assert result.converged
-    # Turned axes come down a kink in smaller and smaller steps.
+    # Rotated axes descend along a kink in smaller and smaller steps.
     torch.testing.assert_close(result.vector, target, rtol=0, atol=2e-4)
 
 
@@ -92,7 +92,7 @@ def test_minimum_outside_is_found_on_the_bounds() -> None:
     assert (every <= vector(3, -1, 3)).all()
 
 
-def test_noisy_plateau_ends_without_pretending() -> None:
+def test_noisy_plateau_does_not_report_convergence() -> None:
     def plateau(x: Tensor) -> Tensor:
         ripple = 1e-3 * torch.sin(1e4 * x).sum(1)
         return (x.abs().sum(1) - 1).clamp(min=0) + ripple
@@ -116,7 +116,7 @@ def test_values_that_are_not_finite_are_rejected() -> None:
     assert nowhere.value == math.inf
 
 
-def test_start_that_is_not_finite_can_be_left() -> None:
+def test_search_can_leave_a_start_that_is_not_finite() -> None:
     result = minimise(
         lambda x: torch.where(x[:, 0] > 1, math.nan, x[:, 0].square()),
         box(vector(1.2), -math.inf, math.inf, scale=1.2),
@@ -147,7 +147,7 @@ def test_logarithmic_variables_span_decades() -> None:
     assert float(mixed.vector[1]) == pytest.approx(0, abs=1e-4)
 
 
-def test_units_of_the_variables_do_not_matter() -> None:
+def test_result_is_invariant_to_variable_units() -> None:
     # Powers of two scale without rounding, so the two searches agree bit for bit.
     unit = vector(2.0**20, 2.0**-30, 1)
     low, high = vector(-3, -3, -3), vector(3, 3, 3)
@@ -157,7 +157,7 @@ def test_units_of_the_variables_do_not_matter() -> None:
     assert (scaled.value, scaled.iterations) == (plain.value, plain.iterations)
 
 
-def test_every_poll_is_one_call_of_known_size() -> None:
+def test_every_poll_is_one_call_of_fixed_size() -> None:
     sizes = []
 
     def objective(x: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ def test_every_poll_is_one_call_of_known_size() -> None:
     assert sum(sizes) == kept[-1].evaluations
 
 
-def test_resumed_search_is_the_uninterrupted_one_bit_for_bit() -> None:
+def test_resumed_search_equals_the_uninterrupted_one_bit_for_bit() -> None:
     options = {"seed": 7, "max_evaluations": 600}
     variables = box(vector(-1.2, 1))
     kept: list[str] = []
@@ -190,7 +190,7 @@ def test_resumed_search_is_the_uninterrupted_one_bit_for_bit() -> None:
     assert rest == kept[17:]
 
 
-def test_seed_decides_the_rotation() -> None:
+def test_rotation_depends_on_the_seed() -> None:
     def run(seed: int) -> list[float]:
         values: list[float] = []
         minimise(rosenbrock, box(vector(-1.2, 1)), lambda at: values.append(at.value),
@@ -201,7 +201,7 @@ def test_seed_decides_the_rotation() -> None:
     assert run(1) != run(2)
 
 
-def test_limit_of_evaluations_is_kept_and_said() -> None:
+def test_evaluation_limit_is_respected_and_reported() -> None:
     counts: list[int] = []
     result = minimise(
         rosenbrock, box(vector(-1.2, 1)), lambda at: counts.append(at.evaluations),
@@ -228,13 +228,13 @@ def test_interrupt_returns_the_best_so_far() -> None:
     assert result.value == float(bowl(result.vector[None])[0]) < float(bowl(START[None])[0])
 
 
-def test_bad_input_is_refused_at_the_border() -> None:
+def test_bad_input_is_refused_on_entry() -> None:
     with pytest.raises(ValueError, match="tolerance"):
         SearchOptions(tolerance=0.0)
 
 
-def test_a_logarithmic_variable_at_its_bound_is_exactly_there() -> None:
-    """exp(log(x)) may miss x in its last digits, and a fit reports which bounds were reached."""
+def test_logarithmic_variable_reaches_its_bound_exactly() -> None:
+    """exp(log(x)) may miss x in its last digits, and a fit reports active bounds."""
     g = torch.Generator().manual_seed(0)
     upper = 10 ** (6 * torch.rand(100, generator=g, dtype=F64) - 3)
     decades = box(0.5 * upper, 1e-3 * upper, upper, scale=1.0, log=True)
@@ -244,14 +244,14 @@ def test_a_logarithmic_variable_at_its_bound_is_exactly_there() -> None:
 
 
 def valley(seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Slopes of four residuals, turned and of very different size, and where they vanish."""
+    """Slopes of four residuals, rotated and of very different size, and their common zero."""
     random = torch.Generator().manual_seed(seed)
     turned = torch.linalg.qr(torch.randn(4, 4, generator=random, dtype=F64))[0]
     stiffness = vector(1.0, 30.0, 300.0, 1000.0)
     return torch.diag(stiffness) @ turned, turned.mT @ (0.3 / stiffness)
 
 
-def test_quadratic_of_residuals_follows_a_narrow_valley_to_its_end() -> None:
+def test_quadratic_model_of_residuals_follows_a_narrow_valley() -> None:
     slopes, least = valley()
 
     def residuals(x: Tensor) -> list[Tensor]:
@@ -271,15 +271,15 @@ def test_quadratic_of_residuals_follows_a_narrow_valley_to_its_end() -> None:
     by_quadratic, by_polls = (search(cost, variables, options, None, r) for r in (residuals, None))
     assert by_quadratic.converged
     assert by_polls.value > 10 * by_quadratic.value
-    # Within the last bound, the best of the other three.
+    # On the last bound, the optimum of the other three.
     others = torch.linalg.lstsq(slopes[:, :3], slopes @ least - slopes[:, 3] * variables.upper[3])
     expected = torch.cat([others.solution, variables.upper[3:]])
     torch.testing.assert_close(by_quadratic.vector, expected, rtol=0, atol=1e-5)
 
 
-def test_a_decrease_that_is_negligible_ends_the_search() -> None:
+def test_negligible_decrease_ends_the_search() -> None:
     def residuals(x: Tensor) -> list[Tensor]:
-        # An endless slope, ever flatter.
+        # An endless slope that gets ever flatter.
         return [1.0 + torch.exp(-x)]
 
     def cost(x: Tensor) -> Tensor:
@@ -293,7 +293,7 @@ def test_a_decrease_that_is_negligible_ends_the_search() -> None:
     assert part.value == pytest.approx(0.5, rel=0.02)
 
 
-def test_a_search_with_a_quadratic_resumes_bit_for_bit() -> None:
+def test_search_with_a_quadratic_model_resumes_bit_for_bit() -> None:
     def residuals(x: Tensor) -> list[Tensor]:
         return [torch.stack([10 * (x[:, 1] - x[:, 0].square()), 1 - x[:, 0]], -1)]
 

@@ -1,4 +1,4 @@
-"""Control of the rig: gains, balance, swing-up, and exported C in the loop."""
+"""Control of the rig: gains, balancing, swing-up, and exported C in the loop."""
 
 import ctypes
 import math
@@ -29,17 +29,17 @@ LINEAR = linearise(PLANT, UPRIGHT, UPRIGHT, UPRIGHT, 1e-3)
 TOP = study.top_gains(PLANT)
 
 
-def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
+def test_linearised_plant_agrees_with_the_plant_near_upright() -> None:
     start = 1e-6 * torch.tensor([1.0, -2.0, 3.0, -1.0], dtype=torch.float64)
     tau = 1e-6 * torch.tensor([[1.0, 0.5, -1.0, 2.0]], dtype=torch.float64)
     run = rollout(PLANT, None, start, 2 * start, tau)
     state = np.concatenate([start, 2 * start])
     after = LINEAR.a @ state + LINEAR.b @ tau[0].numpy()
-    # RK4 and the exponential differ by (h lambda)^5, the plant and its linear part by squares.
+    # RK4 and the exponential differ by (h lambda)^5, the plant and its linearisation by squares.
     np.testing.assert_allclose(after, np.concatenate([run.q[-1], run.qd[-1]]), atol=1e-14)
 
 
-def test_the_upright_rig_is_unstable_and_its_loops_are_not() -> None:
+def test_upright_rig_is_unstable_and_its_closed_loops_are_stable() -> None:
     joints = np.hstack([np.eye(4), np.zeros((4, 4))])
     assert np.abs(np.linalg.eigvals(LINEAR.a)).max() > 1.003
     assert np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], TOP.feedback))).max() < 1.0
@@ -70,7 +70,7 @@ def test_three_links_stay_upright() -> None:
 
 
 @pytest.mark.slow
-def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
+def test_compensation_reduces_the_limit_cycle_of_a_balanced_link() -> None:
     plant = study.single_link()
     friction = study.true_friction(plant)
     given = {study.NONE: None, study.TRUTH: study.compensation_of(friction)}
@@ -91,7 +91,7 @@ def test_a_fallen_rig_has_no_tracking_error() -> None:
     assert set(study.performance(run, follow=False, settled=0.1).values()) == {math.inf}
 
 
-def test_gains_along_a_motion_that_stays_at_the_top_become_those_of_the_top() -> None:
+def test_gains_along_a_motion_at_upright_converge_to_those_at_upright() -> None:
     still = torch.zeros(3000, 4, dtype=torch.float64)
     way = linearise(PLANT, still, still, still, 1e-3)
     found = gains_along(way, still[:, 0].numpy(), LINEAR, study.weights(4))
@@ -106,7 +106,7 @@ def test_a_swing_up_without_time_is_refused() -> None:
 
 @pytest.mark.slow
 def test_three_links_swing_up_and_stay() -> None:
-    """The plan knows the links' friction roughly; the arm's is compensated by a true model."""
+    """The plan uses approximate friction of the links; the arm's is compensated by a true model."""
     friction = study.true_friction(PLANT)
     guess = LFM(4, [0.01, 0.002]).requires_grad_(False)
     way = study.way_up(PLANT, guess)
@@ -153,7 +153,7 @@ def test_exported_c_in_the_loop_gives_the_same_motion(kind: type, tmp_path: Path
         for n, one in given.items()
     }
     runs = study.controlled(PLANT, friction, controllers, seconds=0.4)
-    # Torques pass a converter of 16 bits, which removes what the last bits of exp differ by.
+    # Torques pass a 16-bit converter, which removes last-bit differences of exp.
     assert torch.equal(runs["torch"].tau, runs["C"].tau)
     assert torch.equal(runs["torch"].q, runs["C"].q)
     assert not torch.equal(runs["none"].q, runs["C"].q)

@@ -1,4 +1,4 @@
-"""Evolution of controllers: what it starts from, what it finds, and that it can be resumed."""
+"""Evolution of controllers: start, result, and resumption."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ OPTIONS = EvolutionOptions(prices=(0.0, 0.5), population=9, generations=4)
 
 
 def samples() -> TorqueSamples:
-    """Friction of a controller whose outputs are half of the paper's."""
+    """Friction of a controller with half of the paper's outputs."""
     random = torch.Generator().manual_seed(0)
     qd, qdd, load = (
         scale * (2 * torch.rand(120, generator=random, dtype=torch.float64) - 1)
@@ -35,7 +35,7 @@ def samples() -> TorqueSamples:
     return TorqueSamples(qd, qdd, load.abs(), LINEAR.torque(qd, load.abs(), coefficients, V_SMOOTH))
 
 
-def test_the_genes_of_a_controller_express_it() -> None:
+def test_controller_genome_round_trip_is_exact() -> None:
     again = module._expressed(START, module._genes_of(START).tolist())
     given = samples()
     torch.testing.assert_close(
@@ -43,7 +43,7 @@ def test_the_genes_of_a_controller_express_it() -> None:
     )
 
 
-def test_evolution_improves_and_prices_cost_rules() -> None:
+def test_evolution_improves_and_rule_penalty_removes_rules() -> None:
     given = samples()
     front = evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=OPTIONS)
     assert min(c.error for c in front) < 0.9 * torque_error(START, LINEAR, given, V_SMOOTH)
@@ -57,7 +57,7 @@ def test_evolution_improves_and_prices_cost_rules() -> None:
 
 
 @pytest.mark.slow
-def test_a_resumed_evolution_is_the_whole_one(tmp_path: Path) -> None:
+def test_resumed_evolution_equals_the_uninterrupted_one(tmp_path: Path) -> None:
     given, file = samples(), tmp_path / "kept.json"
     whole = evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=OPTIONS)
     half = replace(OPTIONS, generations=2, checkpoint=file)
@@ -73,7 +73,7 @@ def test_a_resumed_evolution_is_the_whole_one(tmp_path: Path) -> None:
         evolve(START, LINEAR, given, v_smooth=V_SMOOTH, options=replace(half, seed=7))
 
 
-def test_the_front_has_no_candidate_that_another_beats() -> None:
+def test_front_contains_no_dominated_candidate() -> None:
     def candidate(rules: int, error: float) -> Candidate:
         return Candidate(START, error, rules)
 
@@ -81,18 +81,18 @@ def test_the_front_has_no_candidate_that_another_beats() -> None:
     assert [(c.rules, c.error) for c in front] == [(3, 1.5), (7, 1.0)]
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="population"):
         EvolutionOptions(population=3)
 
 
-def test_a_controller_keeps_a_rule() -> None:
+def test_controller_keeps_at_least_one_rule() -> None:
     genes = module._genes_of(START)
     genes[-len(START.rule_base.rules) :] = np.linspace(0.0, 0.4, len(START.rule_base.rules))
     assert len(module._expressed(START, genes.tolist()).rule_base.rules) == 1
 
 
-def test_averages_over_blocks_ignore_noise_that_alternates() -> None:
+def test_averages_over_blocks_ignore_alternating_noise() -> None:
     given = samples()
     noise = 0.1 * (-1.0) ** torch.arange(len(given.qd))
     noisy = replace(given, torque=torque_of_the_start(given) + noise)

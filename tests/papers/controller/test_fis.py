@@ -1,4 +1,4 @@
-"""MATLAB's `.fis` text: every function, rules of every kind, errors that name their line."""
+"""MATLAB's `.fis` text: every function, all kinds of rules, errors that name their line."""
 
 from pathlib import Path
 
@@ -59,7 +59,7 @@ MF2='high':'trimf',[0.6 1 1.4]
 """
 
 
-def test_functions_take_matlabs_order_of_parameters() -> None:
+def test_functions_use_matlabs_parameter_order() -> None:
     rules = parse_fis(TEXT)
     velocity, acceleration = rules.inputs
     assert velocity.terms == ["slow", "middle", "fast"]
@@ -82,7 +82,7 @@ def test_functions_take_matlabs_order_of_parameters() -> None:
     assert held["driving"] == pytest.approx([1, half_sigma, half_sigma])
 
 
-def test_or_is_the_stronger_of_both_conditions() -> None:
+def test_or_is_the_maximum_of_both_conditions() -> None:
     controller = MamdaniController(parse_fis(TEXT))
     rules = controller.rule_base.rules
     assert [(rule.given, rule.then, rule.weight) for rule in rules] == [

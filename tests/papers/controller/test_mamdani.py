@@ -1,4 +1,4 @@
-"""The controller is the textbook inference, bounded, differentiable, and blind to spelling."""
+"""The controller equals textbook inference, is bounded, differentiable, independent of names."""
 
 import math
 from dataclasses import replace
@@ -41,8 +41,8 @@ def naive(rules: RuleBase, x: np.ndarray, points: int, centroid: str) -> np.ndar
                     member = next(one for one in asked.sets if one.name == term)
                     held.append(float(member(torch.tensor(value, dtype=FLOAT64))))
             if rule.then[o] != "*":
-                said = next(one for one in variable.sets if one.name == rule.then[o])
-                shape = said(torch.as_tensor(universe)).numpy()
+                consequent = next(one for one in variable.sets if one.name == rule.then[o])
+                shape = consequent(torch.as_tensor(universe)).numpy()
                 total = np.maximum(total, np.minimum(shape, min(held) * rule.weight))
         weight = np.ones(points)
         if centroid == "trapezoid":
@@ -53,14 +53,14 @@ def naive(rules: RuleBase, x: np.ndarray, points: int, centroid: str) -> np.ndar
 
 @pytest.mark.parametrize("joint", [2, 3, 4])
 @pytest.mark.parametrize("centroid", ["trapezoid", "sum"])
-def test_it_is_the_textbook_inference(joint: int, centroid: str) -> None:
+def test_output_equals_textbook_inference(joint: int, centroid: str) -> None:
     controller = paper_controller(joint, centroid=centroid)
     x = samples(controller, 20)
     expected = np.stack([naive(controller.rule_base, one, 101, centroid) for one in x.numpy()])
     np.testing.assert_allclose(controller.infer(x).numpy(), expected, rtol=1e-12)
 
 
-def test_it_agrees_with_simpful() -> None:
+def test_output_agrees_with_simpful() -> None:
     simpful = pytest.importorskip("simpful")
     controller = paper_controller(2, centroid="sum", points=101)
     rules = controller.rule_base
@@ -68,7 +68,7 @@ def test_it_agrees_with_simpful() -> None:
     for variable in (*rules.inputs, *rules.outputs):
         sets = []
         for term in variable.sets:
-            # Within the universe a shoulder at its end is the Gaussian's one half.
+            # Within the universe, a shoulder at its end is one half of a Gaussian.
             member = simpful.Gaussian_MF(*term.parameters)
             sets.append(simpful.FuzzySet(function=member, term=term.name))
         system.add_linguistic_variable(
@@ -100,7 +100,7 @@ def test_output_stays_in_its_universe(velocity: float, acceleration: float, join
         assert variable.universe[0] < value < variable.universe[1]
 
 
-def test_the_border_is_in_radians_and_any_batch_shape_is_kept() -> None:
+def test_inputs_are_in_radians_and_any_batch_shape_is_kept() -> None:
     controller = paper_controller(3)
     x = samples(controller, 1200)
     y = controller(x[:, 0] * DEGREE, x[:, 1] * DEGREE)
@@ -109,7 +109,7 @@ def test_the_border_is_in_radians_and_any_batch_shape_is_kept() -> None:
     assert controller(torch.tensor(1.0), torch.tensor(2.0)).shape == (2,)
 
 
-def test_outside_the_universe_counts_as_its_edge_and_nan_stays() -> None:
+def test_inputs_are_clamped_to_the_universe_and_nan_is_kept() -> None:
     controller = paper_controller(2)
     edge = torch.stack([controller.upper, controller.lower])
     beyond = edge + torch.tensor([[1e4], [-1e4]])
@@ -140,7 +140,7 @@ def test_order_of_rules_and_names_of_terms_do_not_matter() -> None:
     assert torch.equal(MamdaniController(relabelled).infer(x), controller.infer(x))
 
 
-def test_mirroring_the_outputs_mirrors_the_controller() -> None:
+def test_mirrored_outputs_mirror_the_controller() -> None:
     rules = paper_controller(2).rule_base
 
     def mirrored(variable: Variable) -> Variable:
@@ -158,18 +158,18 @@ def test_mirroring_the_outputs_mirrors_the_controller() -> None:
     torch.testing.assert_close(other.infer(x), -controller.infer(x), rtol=1e-12, atol=0)
 
 
-def test_finer_universes_converge_by_second_order() -> None:
+def test_finer_universes_converge_with_second_order() -> None:
     x = samples(paper_controller(2), 50)
     exact = paper_controller(2, points=12801).infer(x)
     errors = [
         (paper_controller(2, points=n).infer(x) - exact).abs().mean().item() for n in (51, 201, 801)
     ]
-    # Kinks of the clipped sets between points leave second order on average, not for every x.
+    # Kinks of the clipped sets between points give second order on average, not for every x.
     assert errors[1] < errors[0] / 8
     assert errors[2] < errors[1] / 8
 
 
-def test_gradients() -> None:
+def test_gradients_equal_finite_differences() -> None:
     controller = paper_controller(4)
     x = samples(controller, 6).requires_grad_()
     span = controller.upper - controller.lower
@@ -207,7 +207,7 @@ MF2='high':'trimf',[1 1.5 2]
 """
 
 
-def test_where_no_rule_fires_the_middle_is_given_with_zero_gradient() -> None:
+def test_output_without_firing_rules_is_the_middle_with_zero_gradient() -> None:
     controller = MamdaniController(parse_fis(GAPPED, units=("1", "1")))
     x = torch.tensor([[5.0, 0.0], [0.0, 0.0], [10.0, 0.0]], dtype=FLOAT64, requires_grad=True)
     y = controller.infer(x)
@@ -226,7 +226,7 @@ def test_unsound_options_are_refused() -> None:
         MamdaniController(rules, points=1)
 
 
-def test_controller_map_is_the_controller_in_si():
+def test_controller_map_shows_the_controller_in_si():
     controller = paper_controller(2)
     figure = controller_surface(controller)
     maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]

@@ -1,4 +1,4 @@
-"""Rule files: what is written is read back, and what is unsound is named."""
+"""Rule files: lossless round trips, and errors that name what is invalid."""
 
 import json
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def small() -> dict:
     return json.loads(json.dumps(SMALL))
 
 
-def test_a_table_gives_a_rule_for_every_cell() -> None:
+def test_table_gives_one_rule_per_cell() -> None:
     rules = parse_rules(json.dumps(SMALL))
     assert {rule.given: rule.then for rule in rules.rules} == {
         ("slow", "braking"): ("low",),
@@ -80,7 +80,7 @@ def test_rules_may_be_listed_with_weights_and_wildcards() -> None:
     )  # fmt: skip
 
 
-def test_the_papers_three_joints_share_their_rules() -> None:
+def test_three_joints_of_the_paper_share_their_rules() -> None:
     bases = [paper_controller(joint).rule_base for joint in (2, 3, 4)]
     assert bases[0].rules == bases[1].rules == bases[2].rules
     assert len(bases[0].rules) == 25
@@ -185,7 +185,7 @@ def test_unsound_listed_rules_are_refused(rule: dict, message: str) -> None:
         parse_rules(json.dumps(document))
 
 
-def test_sets_must_ascend_and_names_differ() -> None:
+def test_sets_must_ascend_and_have_unique_names() -> None:
     rules: RuleBase = paper_controller(2).rule_base
     variable = rules.inputs[0]
     with pytest.raises(ValueError, match="ascend"):

@@ -27,18 +27,18 @@ def controller_samples(**options: object) -> ControllerSamples:
     return found
 
 
-def test_targets_are_what_the_controllers_say_of_the_measured_motion(tmp_path: Path) -> None:
+def test_targets_are_the_controllers_outputs_for_the_measured_motion(tmp_path: Path) -> None:
     samples = controller_samples(duration=1.0, cache=tmp_path)
     assert samples.x.shape == samples.y.shape == (1000, 3, 2)
     assert samples.output_names == ("B", "C")
     assert (samples.x[..., 0] >= 0).all()
     for joint, number in enumerate((2, 3, 4)):
-        said = paper_controller(number)(samples.x[:, joint, 0], samples.x[:, joint, 1])
+        expected = paper_controller(number)(samples.x[:, joint, 0], samples.x[:, joint, 1])
         # The files have nine digits.
-        torch.testing.assert_close(said, samples.y[:, joint], rtol=1e-7, atol=0.0)
+        torch.testing.assert_close(expected, samples.y[:, joint], rtol=1e-7, atol=0.0)
 
 
-def test_what_was_built_is_read_later_and_a_change_is_noticed(tmp_path: Path) -> None:
+def test_built_set_is_reread_and_changes_are_detected(tmp_path: Path) -> None:
     first = controller_samples(duration=0.2, cache=tmp_path)
     (folder,) = (p for p in tmp_path.iterdir() if p.is_dir())
     assert checksums(controller_samples(duration=0.2, cache=tmp_path)) == checksums(first)
@@ -49,7 +49,7 @@ def test_what_was_built_is_read_later_and_a_change_is_noticed(tmp_path: Path) ->
         controller_samples(duration=0.2, cache=tmp_path)
 
 
-def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Path) -> None:
+def test_user_tables_are_read_by_column_names(tmp_path: Path) -> None:
     first = controller_samples(duration=0.2, cache=tmp_path / "cache")
     tables = {name: first.to_pandas(j) for j, name in enumerate(first.joint_names)}
 
@@ -74,7 +74,7 @@ def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Pat
     ):
         with pytest.raises(ValueError, match=f"joint3.csv.gz needs {fault}"):
             read(joint3=wrong)
-    # Joints that agree in their times, in a wrong order.
+    # Joints with equal times, in a wrong order.
     turned = {name: table[::-1] for name, table in tables.items()}
     with pytest.raises(
         ValueError, match=r"order of time, got 0.198 after 0.199 s in row 2; sort them"
@@ -83,7 +83,7 @@ def test_tables_of_ones_own_are_read_by_the_names_of_their_columns(tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", [n for n in datasets.names() if n.endswith("_twin")])
-def test_a_loaded_twin_is_the_one_that_was_made(name: str, tmp_path: Path) -> None:
+def test_loaded_twin_equals_the_generated_one(name: str, tmp_path: Path) -> None:
     made = twin.make(name.removesuffix("_twin"), duration=0.2, seed=3)
     for _ in ("built", "read"):
         found = datasets.load(name, seed=3, duration=0.2, cache=tmp_path)
@@ -107,14 +107,14 @@ def test_bad_names_are_refused_before_anything_is_written(tmp_path: Path) -> Non
     assert not [p for p in tmp_path.iterdir() if p.is_dir()]
 
 
-def test_a_motion_needs_a_controller_for_each_joint() -> None:
+def test_motion_needs_one_controller_per_joint() -> None:
     still = Motion(np.arange(3.0), *(np.zeros((3, 2)) for _ in range(3)))
     with pytest.raises(ValueError, match="2 joints"):
         sampled([paper_controller(2)], still, joint_names=("a", "b"))
 
 
 @pytest.mark.slow
-def test_the_full_set_is_that_of_its_card(tmp_path: Path) -> None:
+def test_full_set_matches_its_data_card(tmp_path: Path) -> None:
     card = (CARDS / "tlrip_controller" / "README.md").read_text(encoding="utf-8")
     samples = controller_samples(cache=tmp_path)
     assert len(samples) == 40_000

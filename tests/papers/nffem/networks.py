@@ -1,4 +1,4 @@
-"""Small networks and data that the tests of Jacobians and evidence train."""
+"""Small networks and data for the tests of Jacobians and evidence."""
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ class RadialBasis(nn.Module):
 
 
 class Tanh(nn.Module):
-    """1-S-1 network with tanh units, spread over [-1, 1] at the start (Nguyen and Widrow)."""
+    """1-S-1 network with tanh units, initially spread over [-1, 1] (Nguyen and Widrow)."""
 
     def __init__(self, units: int, seed: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Laws of Bayesian regularisation."""
+"""Properties of Bayesian regularisation."""
 
 import copy
 import math
@@ -28,7 +28,7 @@ def regression(seed: int, n: int = 60) -> tuple[Tensor, Tensor]:
 
 
 def predictive_std(fit: EvidenceResult, model: nn.Module, x: Tensor, noise: bool = True) -> Tensor:
-    """Standard deviation of a model's one output by the covariance and, if asked for, the noise."""
+    """Standard deviation of a model's output by the covariance and, optionally, the noise."""
     rows = torch.cat([J for _, _, (J,) in jacobian_pieces(model, x)])
     return (((rows @ fit.covariance) * rows).sum(1) + noise * 0.5 / fit.beta).sqrt()
 
@@ -55,7 +55,7 @@ def test_identities_hold_at_convergence() -> None:
 @pytest.mark.slow
 def test_effective_parameters_saturate_as_units_are_added() -> None:
     # Foresee and Hagan's first example: gamma stays near 8.7 from four units on, while the
-    # parameters grow from 13 to 31. The noise of a data set moves it by about one.
+    # parameters grow from 13 to 31. The noise of a data set changes it by about one.
     x, y = triangle_wave(0)
     gamma, evidence = {}, {}
     for units in (1, 2, 3, 4, 6, 10):
@@ -71,12 +71,12 @@ def test_effective_parameters_saturate_as_units_are_added() -> None:
     assert gamma[2] < 7
     for units in (4, 6, 10):
         assert abs(gamma[units] - 8.7) < 1.2
-    # The evidence knows that one and two units are too few, and does not fall off after.
+    # The evidence shows that one and two units are too few, and stays high for more.
     assert evidence[1] < evidence[2] - 20 < evidence[3] - 20
     assert max(evidence[n] for n in (4, 6, 10)) - min(evidence[n] for n in (4, 6, 10)) < 6
 
 
-def test_linear_regression_reaches_the_maximum_of_its_closed_form() -> None:
+def test_linear_regression_reaches_the_closed_form_maximum() -> None:
     X, y = regression(0)
     prior = {"a": 0.2, "b": 0.01 * noise(8, 8)}
     fit = bayesian_regularisation(
@@ -99,7 +99,7 @@ def test_linear_regression_reaches_the_maximum_of_its_closed_form() -> None:
 
 
 @pytest.mark.slow
-def test_a_group_of_its_own_for_the_strong_beats_one_alpha_for_all() -> None:
+def test_separate_alpha_for_strong_weights_beats_a_single_alpha() -> None:
     gain, error = 0.0, {"one": 0.0, "two": 0.0}
     for seed in range(0, 100, 10):
         X, y = regression(seed, n=20)
@@ -111,7 +111,7 @@ def test_a_group_of_its_own_for_the_strong_beats_one_alpha_for_all() -> None:
         gain += two.log_evidence - single.log_evidence
         error["one"] += float((single.w - truth).square().sum())
         error["two"] += float((two.w - truth).square().sum())
-    assert gain > 10 * 3  # three nats a data set: strong evidence by any scale
+    assert gain > 10 * 3  # three nats per data set: strong evidence by any standard
     assert error["two"] < 0.7 * error["one"]
 
 
@@ -129,7 +129,7 @@ def coverage(seed: int, x: Tensor, clean: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.slow
-def test_error_bars_cover_what_they_claim() -> None:
+def test_error_bars_have_their_stated_coverage() -> None:
     x = torch.linspace(-1, 1, 80, dtype=F64)
     clean = torch.tanh(2 * x) - 0.8 * torch.tanh(5 * x - 2)
     shares = torch.stack([torch.stack(coverage(seed, x, clean)) for seed in range(100)]).mean(0)
@@ -138,7 +138,7 @@ def test_error_bars_cover_what_they_claim() -> None:
 
 
 @pytest.mark.slow
-def test_error_bars_of_a_linear_model_cover_what_they_claim() -> None:
+def test_error_bars_of_a_linear_model_have_their_stated_coverage() -> None:
     inside = []
     for seed in range(100):
         X = noise(seed, 40, 6)
@@ -151,7 +151,7 @@ def test_error_bars_of_a_linear_model_cover_what_they_claim() -> None:
     assert 0.90 <= float(torch.stack(inside).double().mean()) <= 0.98
 
 
-def test_interrupt_keeps_what_was_reached() -> None:
+def test_interrupt_keeps_the_best_result() -> None:
     x, y = triangle_wave(0)
     calls = 0
 
@@ -172,7 +172,7 @@ def test_interrupt_keeps_what_was_reached() -> None:
     assert float((model(x) - y).detach().square().sum()) < before
 
 
-def test_error_of_the_model_leaves_it_as_it_was() -> None:
+def test_error_of_the_model_leaves_it_unchanged() -> None:
     x, y = triangle_wave(0)
     calls = 0
 
@@ -192,7 +192,7 @@ def test_error_of_the_model_leaves_it_as_it_was() -> None:
 
 
 class Root(nn.Module):
-    """sqrt(w) x: not a number left of w = 0."""
+    """sqrt(w) x, which is NaN for negative w."""
 
     def __init__(self, w: float) -> None:
         super().__init__()
@@ -202,7 +202,7 @@ class Root(nn.Module):
         return self.w.sqrt() * x
 
 
-def test_not_a_number_on_the_way_is_stepped_back_from() -> None:
+def test_step_to_nan_is_rejected() -> None:
     x = torch.linspace(0, 1, 50, dtype=F64)
     y = 0.1 * x + 1e-3 * noise(0, 50)
     model = Root(4.0)  # the first full step from w = 4 ends at about -3.6
@@ -211,7 +211,7 @@ def test_not_a_number_on_the_way_is_stepped_back_from() -> None:
     assert abs(float(model.w) - 0.01) < 5 * float(fit.covariance.sqrt())
 
 
-def test_not_a_number_at_the_start_is_said_and_changes_nothing() -> None:
+def test_nan_at_the_start_is_reported_and_changes_nothing() -> None:
     model = Root(-1.0)
     x = torch.linspace(0, 1, 50, dtype=F64)
     fit = bayesian_regularisation(model, x, x)
@@ -234,12 +234,12 @@ def test_noise_floor_ends_the_fit() -> None:
     rms = math.sqrt(fit.error_squares / fit.samples)
     assert 0 < rms <= 1e-3
     assert math.sqrt(0.5 / fit.beta) >= 1e-3
-    # Without a floor it goes on, down to the rounding of the targets if need be.
+    # Without a floor it continues, down to the rounding of the targets if necessary.
     exact = bayesian_regularisation(copy.deepcopy(model), x, y)
     assert exact.error_squares < 1e-6 * fit.error_squares
 
 
-def test_prior_holds_what_the_data_do_not_see() -> None:
+def test_prior_determines_weights_without_data() -> None:
     X, y = regression(0)
     X = X.clone()
     X[:, 3:] = 0
@@ -269,7 +269,7 @@ def test_units_of_the_targets_shift_the_evidence_by_their_jacobian() -> None:
         assert math.isclose(scaled.gamma[group], gamma, rel_tol=1e-6)
 
 
-def test_bad_input_is_refused_at_the_border() -> None:
+def test_bad_input_is_refused_on_entry() -> None:
     X, y = regression(0)
 
     def fit(**options: object) -> EvidenceResult:

@@ -16,7 +16,7 @@ from nfriction.papers.nffem.fit_rbf import place_units
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.signals import Motion
 from tests.fitting.recordings import F64, pendulum
-from tests.fitting.test_trajectory import ABSOLUTE, windows
+from tests.fitting.test_shooting_problem import ABSOLUTE, windows
 
 Case = tuple[PendulumChain, Recording, FitResult]
 
@@ -41,15 +41,15 @@ def network(case: Case, max_steps: int) -> FitResult:
                max_steps=max_steps)  # fmt: skip
 
 
-def test_a_network_with_jerk_beats_the_law_that_it_starts_from(case: Case) -> None:
+def test_network_with_jerk_beats_its_initial_law(case: Case) -> None:
     found = network(case, 4)
     assert "rejected" not in found.status
     assert found.residual < 0.8 * case[2].residual
-    # Set to the recording's rate, at which the filters of jerk and snap run.
+    # Set to the recording's sample rate, at which the filters of jerk and snap run.
     schedule = found.model.schedule
     assert isinstance(schedule, RBFCoefficients)
     assert schedule.step == pytest.approx(2e-3)
-    # The coefficient that it learnt falls with speed, as the true one does.
+    # The learnt coefficient falls with speed, as the true one does.
     slow, fast = found.model.coefficients(
         torch.tensor([[1.0], [6.0]], dtype=torch.float64), torch.zeros(2, 1, dtype=torch.float64)
     )
@@ -58,7 +58,7 @@ def test_a_network_with_jerk_beats_the_law_that_it_starts_from(case: Case) -> No
 
 
 @pytest.mark.parametrize("lost", ["hold-out", "long windows"])
-def test_a_network_that_gains_nothing_is_its_law(
+def test_network_without_improvement_is_replaced_by_its_law(
     case: Case, lost: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nfriction.papers.nffem.fit_rbf.improves", lambda *_: lost != "hold-out")
@@ -75,7 +75,7 @@ def test_a_network_that_gains_nothing_is_its_law(
     assert found.model.schedule.step == pytest.approx(2e-3)
 
 
-def test_gradient_with_a_memory_is_the_cost_s_derivative() -> None:
+def test_gradient_with_hidden_state_equals_the_cost_derivative() -> None:
     w = windows()
     model = NFLFM(2, v_smooth=0.1, network="rbf", head_units=4, derivatives=1, sample_time=2e-3)
     schedule = model.requires_grad_(False).schedule
@@ -94,7 +94,7 @@ def test_gradient_with_a_memory_is_the_cost_s_derivative() -> None:
     along = torch.zeros_like(x)
     along[:count] = torch.randn(count, generator=g, dtype=F64)
     slope = float(p.cost(x + 1e-7 * along) - p.cost(x - 1e-7 * along)) / 2e-7
-    # The memory is held in derivatives, though the motion moves it.
+    # Derivatives treat the hidden state as fixed, although it depends on the motion.
     assert float(local.gradient @ along) == pytest.approx(slope, rel=0.01)
     # Finer steps would advance it sooner, which is no error of the integration.
     assert not integration_error(p, SimpleNamespace(x=x, hessian=local.hessian)).any()  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Laws of the chunked per-sample Jacobians and normal equations."""
+"""Properties of the chunked per-sample Jacobians and normal equations."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_flatten_and_unflatten_are_inverse_and_ordered() -> None:
         unflatten(vector[1:], parameters)
 
 
-def test_jacobian_is_the_one_of_reverse_differentiation_sample_by_sample() -> None:
+def test_jacobian_equals_reverse_differentiation_of_each_sample() -> None:
     model, x = RadialBasis(), noise(0, 7, 2)
     J = per_sample_jacobian(model, x)
     assert J.shape == (7, 2, 52)
@@ -46,7 +46,7 @@ def test_jacobian_is_the_one_of_reverse_differentiation_sample_by_sample() -> No
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 10, 1000])
-def test_chunks_change_nothing(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_does_not_depend_on_the_chunks(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model, x, y = RadialBasis(), noise(0, 10, 2), noise(1, 10, 2)
     # Other values than at first: derivatives must follow the parameters.
     assign(model, flatten(trainable(model)) + 0.1)
@@ -83,7 +83,7 @@ def test_memory_stays_bounded_on_a_long_recording() -> None:
     assert max(sizes) * 2 * 52 * 8 * 10 < 100e6
 
 
-def test_misfits_are_refused_at_the_border() -> None:
+def test_inconsistent_sizes_are_refused_on_entry() -> None:
     model, x = Linear(2), noise(0, 5, 2)
     with pytest.raises(ValueError, match="must agree"):
         normal_equations(model, x, noise(1, 5, 1))

@@ -1,4 +1,4 @@
-"""Online learning: it finds a changed friction, stays bounded, and is the same in C."""
+"""Online learning adapts to changed friction, stays bounded, and is equal in C."""
 
 import ctypes
 import subprocess
@@ -19,7 +19,7 @@ OPTIONS = OnlineOptions(noise=0.02, forgetting=2.0)
 
 
 def model(kind: type = NFLFM, joints: int = 2, acceleration: str = "along_motion"):
-    """Constant coefficients in a network whose units lie over the motion."""
+    """Constant coefficients in a network whose units cover the motion."""
     made = kind(joints, network="rbf", head_units=6, acceleration=acceleration)
     made.requires_grad_(False)
     schedule = made.schedule
@@ -43,7 +43,7 @@ def motions(count: int, joints: int = 2) -> tuple[Tensor, Tensor, Tensor]:
     return 2 * qd, 20 * qdd, 1 + 0.1 * load
 
 
-def test_it_finds_a_friction_that_fell_by_half() -> None:
+def test_halved_friction_is_recovered() -> None:
     made = model()
     online = OnlineNetwork(made, OPTIONS)
     qd, qdd, load = motions(800)
@@ -53,11 +53,11 @@ def test_it_finds_a_friction_that_fell_by_half() -> None:
     judged = slice(600, None)
     now, _ = online(qd[judged], qdd[judged], load[judged])
     error = (now - true[judged]).square().mean().sqrt()
-    # Frozen it would err by as much as the torque itself.
+    # Without learning the error would be as large as the torque itself.
     assert error < 0.05 * true[judged].square().mean().sqrt()
 
 
-def test_it_stays_as_it_was_without_an_error_and_without_motion() -> None:
+def test_zero_error_or_rest_changes_nothing() -> None:
     made = model()
     online = OnlineNetwork(made, OPTIONS)
     qd, qdd, load = motions(100)
@@ -72,14 +72,14 @@ def test_it_stays_as_it_was_without_an_error_and_without_motion() -> None:
     assert torch.equal(online.covariance, spread)
 
 
-def test_wild_torques_leave_everything_bounded() -> None:
+def test_outlying_torques_leave_everything_bounded() -> None:
     made = model()
     online = OnlineNetwork(made, OPTIONS)
     first = online.covariance.diagonal(dim1=1, dim2=2).sum(-1)
     qd, qdd, load = motions(400)
     for sample in zip(qd, qdd, load, 1e6 * torch.randn_like(qd), strict=True):
         online.learn(*sample)
-        # One speed alone, for a long time: nothing is known of the others.
+        # A single speed for a long time: the others have no data.
         online.learn(qd[0] * 0 + 1.0, qdd[0] * 0, load[0], qd[0] * 0 + 5.0)
     assert (online.covariance.diagonal(dim1=1, dim2=2).sum(-1) <= first * (1 + 1e-9)).all()
     _, coefficients = online(qd, qdd, load)
@@ -88,7 +88,7 @@ def test_wild_torques_leave_everything_bounded() -> None:
     torch.testing.assert_close(online.most, 3 * made.schedule.network.output_bias.detach())
 
 
-def test_one_outlier_or_an_overflow_moves_little() -> None:
+def test_one_outlier_or_overflow_changes_little() -> None:
     made = model()
     qd, qdd, load = motions(800)
     noise = 0.02 * torch.randn(qd.shape, generator=torch.Generator().manual_seed(1))
@@ -108,7 +108,7 @@ def test_one_outlier_or_an_overflow_moves_little() -> None:
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", [NFLFM, NFNLFM])
 @pytest.mark.parametrize("acceleration", ["signed", "along_motion"])
-def test_the_c_learns_the_same(kind: type, acceleration: str, tmp_path: Path) -> None:
+def test_c_code_learns_the_same(kind: type, acceleration: str, tmp_path: Path) -> None:
     made = model(kind, acceleration=acceleration)
     online = OnlineNetwork(made, OPTIONS)
     source, _ = write_online(made, tmp_path, OPTIONS, name="rig")
@@ -128,7 +128,7 @@ def test_the_c_learns_the_same(kind: type, acceleration: str, tmp_path: Path) ->
     qd, qdd, load = motions(200)
     random = torch.Generator().manual_seed(1)
     noise = 0.05 * torch.randn(qd.shape, generator=random, dtype=torch.float64)
-    # A model's torque lies in memory joint by joint; C takes sample by sample.
+    # A model's torque is stored joint by joint; C uses sample by sample.
     measured = (0.6 * made(qd, qdd, load) + noise).contiguous()
     measured[7, 0], measured[90, 1] = torch.inf, 1e3
     loads = load.clone()

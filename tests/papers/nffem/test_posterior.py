@@ -47,7 +47,7 @@ def test_log_evidence_of_linear_regression_is_exact() -> None:
         assert known.newton_decrement < 1e-20 * N
 
 
-def test_gamma_and_covariance_are_those_of_the_definition() -> None:
+def test_gamma_and_covariance_equal_their_definitions() -> None:
     X, y, w0 = problem()
     alpha, beta = torch.tensor([0.3, 2.0], dtype=F64), 1.7
     w = mode(X, y, w0, alpha, beta)
@@ -59,7 +59,7 @@ def test_gamma_and_covariance_are_those_of_the_definition() -> None:
         torch.testing.assert_close(known.gamma[group], size - shrunk, rtol=1e-11, atol=0)
 
 
-def test_identities_are_the_stationary_point_of_the_evidence() -> None:
+def test_identities_hold_at_the_stationary_point_of_the_evidence() -> None:
     X, _, w0 = problem()
     y = X @ (w0 + torch.tensor([1.0, -1.0, 0.2, 0.1, -0.3])) + 0.2 * noise(3, N)
     alpha, beta = torch.ones(2, dtype=F64), 1.0
@@ -88,7 +88,7 @@ def test_newton_decrement_is_the_gain_of_a_full_step() -> None:
     assert math.isclose(known.newton_decrement, gain, rel_tol=1e-11)
 
 
-def test_no_data_give_no_effective_parameter_and_all_data_give_all() -> None:
+def test_effective_parameters_range_from_none_to_all() -> None:
     X, y, w0 = problem()
     local = equations(X, y, w0)
     strong = known_at(local, 0.0 * w0, torch.full((2,), 1e30, dtype=F64), 1.0)
@@ -97,7 +97,7 @@ def test_no_data_give_no_effective_parameter_and_all_data_give_all() -> None:
     torch.testing.assert_close(weak.gamma, torch.tensor([2, 3], dtype=F64), rtol=1e-10, atol=0)
 
 
-def test_singular_data_are_carried_by_the_prior() -> None:
+def test_singular_data_are_regularised_by_the_prior() -> None:
     X, y, w0 = problem()
     X[:, 4] = X[:, 3]
     local = equations(X, y, w0)

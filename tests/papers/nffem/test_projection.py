@@ -1,4 +1,4 @@
-"""Laws of placing sets with the output layer eliminated."""
+"""Placement of fuzzy sets by variable projection of the output layer."""
 
 import pytest
 import torch
@@ -41,13 +41,13 @@ def squares(layer: nn.Module, x: Tensor, y: Tensor) -> float:
 
 
 @pytest.mark.parametrize("kind", LAYERS)
-def test_its_cost_is_what_the_best_output_layer_leaves(kind: str) -> None:
+def test_cost_is_the_residual_of_the_best_output_layer(kind: str) -> None:
     layer, x = shaken(LAYERS[kind](), 0.1), samples(300)
     y = surface(x)
     problem = Projection(layer, x, y, ridge=1e-9)
     left = float(problem.cost(problem.theta))
     assert squares(layer, x, y) == pytest.approx(2 * left, rel=1e-5)
-    # No other output layer does better.
+    # No other output layer is better.
     for p in (p for n, p in layer.named_parameters() if "consequents" in n or "output" in n):
         with torch.no_grad():
             p.mul_(1.001)
@@ -56,7 +56,7 @@ def test_its_cost_is_what_the_best_output_layer_leaves(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", LAYERS)
-def test_it_has_the_slope_of_its_cost(kind: str) -> None:
+def test_gradient_equals_that_of_the_cost(kind: str) -> None:
     layer, x = shaken(LAYERS[kind](), 0.1), samples(400)
     problem = Projection(layer, x, surface(x), ridge=1e-3)
     theta = problem.theta
@@ -74,7 +74,7 @@ def test_it_has_the_slope_of_its_cost(kind: str) -> None:
     assert eigenvalues.min() > -1e-9 * eigenvalues.max()
 
 
-def test_sets_are_moved_to_a_better_place_and_frozen_ones_left() -> None:
+def test_sets_are_improved_and_frozen_ones_unchanged() -> None:
     x = samples(300)
     layer = Anfis(1, 2, [3, 3], 2)
     layer.solve_consequents(x, surface(x))

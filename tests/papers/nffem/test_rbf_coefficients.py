@@ -1,4 +1,4 @@
-"""The papers' network as a schedule: what it gives, in rollouts, files and artefacts."""
+"""The papers' network as a schedule: values, rollouts, files and artefacts."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ ORDERS = pytest.mark.parametrize("derivatives", [0, 1, 2])
 
 
 def network(derivatives: int = 0, seed: int = 0) -> tuple[RBFNetwork, Tensor, Tensor]:
-    """A network with its universes; some of its outputs lie beyond theirs."""
+    """A network with its universes; some of its outputs exceed theirs."""
     random = torch.Generator().manual_seed(seed)
     inputs = 2 + derivatives
     made = RBFNetwork(JOINTS, inputs, 10, 2).requires_grad_(False)
@@ -51,7 +51,7 @@ def motions(count: int = 50, seed: int = 0) -> tuple[Tensor, Tensor]:
     return 6.0 * qd, 60.0 * qdd
 
 
-def test_an_untrained_model_is_the_constant_law() -> None:
+def test_untrained_model_equals_the_constant_law() -> None:
     values = torch.tensor([[0.01, 0.02, 0.03, 0.04, 1.0]] * 2, dtype=torch.float64)
     made = NFNLFM(2, values, network="rbf")
     qd = torch.linspace(-5, 5, 20, dtype=torch.float64).reshape(10, 2)
@@ -64,10 +64,10 @@ def test_coefficients_are_the_network_clamped_to_its_universe() -> None:
     inside = torch.stack([qd.abs().clamp(max=10.0), qdd.clamp(-100.0, 100.0)], -1)
     expected = own(inside).clamp(outputs[0], outputs[1])
     torch.testing.assert_close(made.coefficients(qd, qdd), expected)
-    assert not torch.equal(own(inside), expected)  # the clamp was put to the test
+    assert not torch.equal(own(inside), expected)  # the clamp is active
 
 
-def test_acceleration_along_the_motion_makes_both_ways_of_turning_alike() -> None:
+def test_acceleration_along_the_motion_is_direction_independent() -> None:
     made = model("along_motion")
     qd, qdd = motions()
     torch.testing.assert_close(made.coefficients(-qd, -qdd), made.coefficients(qd, qdd))
@@ -93,7 +93,7 @@ def test_files_and_artefacts_keep_the_model(tmp_path: Path, derivatives: int) ->
     again = load(save(made, tmp_path / "model.json"))
     for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True):
         assert torch.equal(a, b)
-    # Each compares the artefact with the model before it takes its place.
+    # Each is compared with the model before it is written.
     assert export.torchscript(again, tmp_path / "model.pt").exists()
     assert export.c(again, tmp_path)
 
@@ -132,7 +132,7 @@ def test_jerk_and_snap_change_the_coefficients() -> None:
 
 @BOTH
 @ORDERS
-def test_sensitivities_are_the_derivatives(acceleration: str, derivatives: int) -> None:
+def test_sensitivities_equal_finite_differences(acceleration: str, derivatives: int) -> None:
     made = schedule(model(acceleration, derivatives))
     qd, qdd = motions(8)
     state = made.initial_state(qd, qdd)
@@ -152,7 +152,7 @@ def test_sensitivities_are_the_derivatives(acceleration: str, derivatives: int) 
     made.set_parameter_vector(own)
     acts = torch.nn.functional.one_hot(found.joint, JOINTS).T.to(own)
     expected = found.parameters[:, None] * acts[None, :, None]
-    # Central differences of a step of 1e-6 keep some nine digits.
+    # Central differences with a step of 1e-6 are accurate to about nine digits.
     torch.testing.assert_close(by_vector, expected, rtol=1e-6, atol=1e-8)
     h = 1e-6
     for slope, (a, b) in ((found.qd, (h, 0.0)), (found.qdd, (0.0, h))):

@@ -1,4 +1,4 @@
-"""Laws of normal equations from columns that outputs share, on the layers that offer them."""
+"""Normal equations from columns shared by outputs, for the layers that offer them."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def frozen_first(module: nn.Module) -> nn.Module:
 
 
 class Plain(nn.Module):
-    """Hides what a network offers beyond its outputs."""
+    """A network that hides everything except its outputs."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -58,9 +58,7 @@ def assert_same(got: NormalEquations, wanted: NormalEquations) -> None:
 
 @pytest.mark.parametrize("groups", [1, 2])
 @pytest.mark.parametrize("kind", LAYERS)
-def test_columns_and_maps_make_the_jacobian_of_reverse_differentiation(
-    kind: str, groups: int
-) -> None:
+def test_columns_and_maps_equal_the_reverse_mode_jacobian(kind: str, groups: int) -> None:
     network, x = shaken(LAYERS[kind](groups)), noise(0, 20, groups, 2)
     wanted = torch.func.jacrev(lambda values: torch.func.functional_call(network, values, (x,)))(
         trainable(network)
@@ -78,7 +76,7 @@ def test_columns_and_maps_make_the_jacobian_of_reverse_differentiation(
 
 @pytest.mark.parametrize("groups", [1, 3])
 @pytest.mark.parametrize("kind", LAYERS)
-def test_columns_give_the_normal_equations_of_the_whole_jacobian(
+def test_columns_give_the_normal_equations_of_the_full_jacobian(
     kind: str, groups: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     layer = shaken(LAYERS[kind](groups))
@@ -93,7 +91,7 @@ def test_columns_give_the_normal_equations_of_the_whole_jacobian(
             assert_same(normal_equations(module, x, y), wanted)
 
 
-def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
+def test_regularisation_uses_the_columns_if_offered() -> None:
     calls = 0
 
     class Watched(RBFNetwork):
@@ -109,12 +107,12 @@ def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
     assert calls >= 16
 
     same = bayesian_regularisation(Plain(plain), x, y, options=EvidenceOptions(max_steps=15))
-    # Rounding, grown over 15 steps of a nonlinear search.
+    # Rounding, amplified over 15 steps of a nonlinear search.
     assert fit.log_evidence == pytest.approx(same.log_evidence, rel=1e-6)
     torch.testing.assert_close(fit.w, same.w, rtol=1e-5, atol=1e-6)
 
 
-def test_the_columns_of_a_long_recording_stay_in_bounded_memory() -> None:
+def test_columns_of_a_long_recording_use_bounded_memory() -> None:
     sizes: list[int] = []
 
     class Watched(RBFNetwork):
@@ -128,18 +126,18 @@ def test_the_columns_of_a_long_recording_stay_in_bounded_memory() -> None:
     assert max(sizes) * (10 + 1 + 40 + 2) <= CHUNK_ENTRIES
 
 
-def test_misfits_are_refused() -> None:
+def test_inconsistent_sizes_are_refused() -> None:
     network, x = RBFNetwork(1, units=3), noise(0, 9, 1, 2)
     with pytest.raises(ValueError, match="must agree"):
         normal_equations(network, x, noise(1, 9, 1, 3))
 
 
-def test_units_far_from_every_sample_cost_no_more() -> None:
-    # Numbers that underflow are fifty times as slow; a unit 24 widths away is as good as none.
+def test_units_far_from_every_sample_are_not_slower() -> None:
+    # Denormal numbers are fifty times as slow; a unit 24 widths away has no effect.
     network, x = RBFNetwork(1, units=5), noise(0, 200, 1, 2)
     with torch.no_grad():
         network.log_widths.fill_(-9.0)
-        said = network.activations(x)
+        activations = network.activations(x)
     tiny = torch.finfo(F64).tiny
-    assert (said.square() >= tiny).all()
-    assert said.min() < 1e-100
+    assert (activations.square() >= tiny).all()
+    assert activations.min() < 1e-100

@@ -1,4 +1,4 @@
-"""Laws of training fuzzy networks by Bayesian regularisation, on samples and on controllers."""
+"""Training of fuzzy networks by Bayesian regularisation, on samples and on controllers."""
 
 import math
 from copy import deepcopy
@@ -52,7 +52,7 @@ NETWORKS = {
 
 
 @pytest.mark.parametrize("kind", NETWORKS)
-def test_change_of_units_is_exact_and_leads_back(kind: str) -> None:
+def test_change_of_units_is_exact_and_reversible(kind: str) -> None:
     network, x = shaken(NETWORKS[kind](2)), samples(50, 2, 2)
     random = [samples(2, 2, seed=seed) for seed in range(4)]
     scaling = Scaling(random[0], random[1].abs() + 0.1, random[2], random[3].abs() + 0.1)
@@ -71,7 +71,7 @@ def rmse(network: nn.Module, x: Tensor, y: Tensor) -> float:
         return float(((network(x) - y) / (y.amax(0) - y.amin(0))).square().mean().sqrt())
 
 
-def test_targets_are_what_the_controller_says_over_its_universes() -> None:
+def test_targets_are_the_controller_outputs_over_its_universes() -> None:
     controller = paper_controller(2)
     x, y = controller_targets(controller, 3000, seed=3)
     torch.testing.assert_close(controller(x[:, 0], x[:, 1]), y, rtol=1e-12, atol=0)
@@ -105,7 +105,7 @@ def test_training_beats_the_least_squares_start(kind: str) -> None:
     assert rmse(network, x[:, None], y[:, None]) < 0.95 * rmse(start, x[:, None], y[:, None])
 
 
-def test_it_starts_from_the_controllers_own_sets_or_from_an_even_grid() -> None:
+def test_training_starts_from_the_controller_sets_or_an_even_grid() -> None:
     controllers = [paper_controller(joint) for joint in (2, 4)]
     frozen = {"samples": 300, "options": TrainingOptions(search_steps=0, max_steps=0)}
     network = Anfis(2, 2, [len(v.sets) for v in controllers[0].rule_base.inputs], 2)
@@ -148,7 +148,7 @@ def test_identities_hold_at_convergence() -> None:
     assert set(fit.alpha) == {"centres", "widths", "consequents"}
 
 
-def test_same_seed_same_network_and_more_starts_no_less_evidence() -> None:
+def test_seed_is_reproducible_and_more_starts_raise_the_evidence() -> None:
     controller = paper_controller(2)
     options = TrainingOptions(search_steps=15, max_steps=10)
     three = replace(options, starts=3)
@@ -160,7 +160,7 @@ def test_same_seed_same_network_and_more_starts_no_less_evidence() -> None:
     assert fits[0].log_evidence >= alone.log_evidence - 1e-6
 
 
-def test_groups_train_as_if_alone() -> None:
+def test_groups_train_independently() -> None:
     controllers = [paper_controller(joint) for joint in (2, 4)]
     both, alone = Anfis(2, 2, [3, 3], 2), Anfis(1, 2, [3, 3], 2)
     options = TrainingOptions(search_steps=10, max_steps=5, seed=5)
@@ -187,13 +187,13 @@ def test_interrupt_leaves_a_usable_network() -> None:
         network, controllers, samples=1000, options=TrainingOptions(callback=interrupt)
     )
     assert [fit.status for fit in fits] == ["stopped"]
-    # The first group keeps what it reached, the second its least-squares start.
+    # The first group keeps its best result, the second its least-squares start.
     for g, (controller, worst) in enumerate(zip(controllers, (0.05, 0.1), strict=True)):
         x, y = controller_targets(controller, 1000, seed=7)
         assert rmse(one_group(network, g), x[:, None], y[:, None]) < worst
 
 
-def test_frozen_parameters_stay() -> None:
+def test_frozen_parameters_are_unchanged() -> None:
     x = 3.0 + samples(300, 1, 2)
     network = Anfis(1, 2, [3, 3], 2)
     network.init_grid(2.0, 4.0)
@@ -205,7 +205,7 @@ def test_frozen_parameters_stay() -> None:
     torch.testing.assert_close(after, before, rtol=1e-12, atol=1e-13)
 
 
-def test_misfits_are_refused_at_the_border() -> None:
+def test_inconsistent_sizes_are_refused_on_entry() -> None:
     network, x = RBFNetwork(1, units=3), samples(50, 1, 2)
     with pytest.raises(ValueError, match="must be"):
         train_network(network, x[:, 0], surface(x))

@@ -1,4 +1,4 @@
-"""Fresh releases: where they start, what an error on them is, and that they can be predicted."""
+"""Fresh releases: initial poses, their errors, and predictability."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def test_errors_are_those_of_free_runs_from_the_poses() -> None:
     ours = np.array(fresh.free_run_errors(plant, model, true), dtype=float)
     assert ours.shape == (10, 3)
     assert np.all((ours > 0) & (ours < 0.01))
-    # Without the first sample's offset that every later one then has, too.
+    # Without the first sample's offset, which all later ones would have, too.
     off = np.array(fresh.free_run_errors(plant, model, true - [0.1, 0.0, 0.0]), dtype=float)
     assert np.all(off[:, 0] > ours[:, 0])
     lost = np.array(true)
@@ -28,7 +28,7 @@ def test_errors_are_those_of_free_runs_from_the_poses() -> None:
     assert fresh.free_run_errors(plant, model, lost)[2] == [None] * 3
 
 
-def test_a_single_wild_release_does_not_decide_the_order(tmp_path: Path) -> None:
+def test_single_outlier_does_not_decide_the_order(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NCFM": 3.0, "ANCFM": 2.0, "NFNCFM": 1.0})
     assert not [text for text in tables.order(made).broken if "NCFM" in text]
     result = made.found("NFNCFM")

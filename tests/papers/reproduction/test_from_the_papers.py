@@ -1,4 +1,4 @@
-"""The checklist that leads from the papers to the code is complete, and names what is there."""
+"""The checklist from the papers to the code is complete, and names existing code."""
 
 import re
 from collections import Counter
@@ -13,7 +13,7 @@ TEXT = PAGE.read_text(encoding="utf-8")
 NAMES = sorted(set(re.findall(r"`(nfriction(?:\.\w+)+)", TEXT)))
 ROMAN = {"I": 1, "II": 2, "III": 3, "IV": 4}
 
-# What the papers have, counted in the papers themselves.
+# Contents of the papers, counted in the papers themselves.
 PAPERS = {
     "equations of the TLRIP paper": {"": range(1, 31)},
     "tables of the TLRIP paper": {"Table": range(1, 12)},
@@ -36,7 +36,7 @@ def rows(heading: str) -> list[list[str]]:
 
 
 def numbered(item: str) -> list[tuple[str, int]]:
-    """Kind and number of everything that an item's first words count up."""
+    """Kind and number of every item that a cell's first words list."""
     if found := re.match(r"(Table|Fig\.)s?\.? ", item.replace("Figs.", "Fig.")):
         kind, words = found[1], re.split(r"[ ,]+", item)[1:]
         counted = []
@@ -79,7 +79,7 @@ def test_every_item_has_a_place_or_a_reason() -> None:
 
 
 def found(name: str) -> object:
-    """The thing of a dotted name: the longest part that is a module, then attributes."""
+    """Object of a dotted name: the longest part that is a module, then attributes."""
     parts = name.split(".")
     for end in range(len(parts), 0, -1):
         try:
@@ -94,13 +94,13 @@ def test_the_page_names_the_code() -> None:
     assert len(NAMES) > 40
 
 
-def test_the_page_names_files_that_are_there() -> None:
+def test_page_names_existing_files() -> None:
     paths = re.findall(r"`((?:trainers|datasets)/[\w./]+)", TEXT)
     assert len(paths) >= 4
     assert all((PAGE.parents[1] / path).exists() for path in paths)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_name_on_the_page_can_be_imported_and_is_explained(name: str) -> None:
+def test_every_name_on_the_page_is_importable_and_documented(name: str) -> None:
     thing = found(name)
     assert getattr(thing, "__doc__", None) or name.endswith("TABLE_6")

@@ -16,8 +16,8 @@ from tests.papers.reproduction.test_tables import workspace
 CHECK_POSE = np.deg2rad([200.56, 32.21, 45.0])
 
 
-def test_files_have_names_of_their_own() -> None:
-    # The swing-up's animation is shown beside its table.
+def test_files_have_unique_names() -> None:
+    # The swing-up's animation is shown next to its table.
     names = [name for item in ITEMS for name in (*item.tables, *item.figures)]
     assert len(names) == len(set(names)) > 30
     assert SWING_UP in names
@@ -33,13 +33,13 @@ def test_the_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
     assert "data:image/png;base64," in page
     assert "http" not in page.replace("http-equiv", "")
     assert "NOT reproduced" in page
-    # How the fit behind a figure ended is said beside it.
+    # The final status of the fit is next to its figure.
     assert "NFNLFM: ended" in page
-    assert "0.1397" not in page  # printed errors are shown in mrad, as ours
+    assert "0.1397" not in page  # printed errors are shown in mrad, like ours
     assert "139.7" in page
 
 
-def test_the_conclusion_follows_the_errors(tmp_path) -> None:
+def test_conclusion_follows_from_the_errors(tmp_path) -> None:
     errors = {"NCFM": 4.0, "LFM": 4.0, "NLFM": 4.0, "rtip-NLFM": 0.5}
     errors |= dict.fromkeys(tables.ADAPTIVE, 3.0) | dict.fromkeys(tables.NEURO_FUZZY, 2.0)
     errors |= dict.fromkeys(tables.PAPERS_WAY, 3.5) | {"NFLFM": 3.2}
@@ -55,7 +55,7 @@ def test_the_conclusion_follows_the_errors(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("effect", [0.0, 1.0])
-def test_the_reason_sees_what_acceleration_does(effect) -> None:
+def test_explanation_detects_the_effect_of_acceleration(effect) -> None:
     made = make("tlrip", duration=2.0)
     truth = {
         label: replace(m, tau_f=np.sign(m.qd) * (1.0 + np.abs(m.qd)) + effect * m.qdd)
@@ -69,7 +69,7 @@ def test_the_reason_sees_what_acceleration_does(effect) -> None:
         assert max(found.values()) < 0.2
 
 
-def test_the_second_papers_swing_starts_as_that_paper_counts() -> None:
+def test_second_papers_swing_uses_that_papers_convention() -> None:
     lines = [ax.lines[0].get_ydata() for ax in second_swing().axes]
     np.testing.assert_allclose([q[0] for q in lines], np.deg2rad([0.0, 20.0, 30.0, 40.0]))
     # From hanging, so that no link swings over the top.
@@ -78,12 +78,12 @@ def test_the_second_papers_swing_starts_as_that_paper_counts() -> None:
 
 def test_independent_simulations_agree() -> None:
     found = agreement(rigs.tlrip(), CHECK_POSE, np.zeros(3))
-    # The twin's mechanics take half the step: RK4 of ours errs by 1e-8 after ten seconds.
+    # The twin's mechanics use half the step: the error of our RK4 is 1e-8 after ten seconds.
     assert (found.loc[TWIN].to_numpy() < 1e-7).all()
 
 
 def test_mujoco_agrees_to_rounding() -> None:
     pytest.importorskip("mujoco")
     found = agreement(rigs.tlrip(), CHECK_POSE, np.zeros(3))
-    # Both take the same RK4 steps.
+    # Both use the same RK4 steps.
     assert (found.loc[MUJOCO].to_numpy() < 1e-10).all()

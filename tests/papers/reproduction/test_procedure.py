@@ -1,4 +1,4 @@
-"""The papers' procedure: controllers keep their rules and span, the network what they say."""
+"""The papers' procedure: controllers keep their rules and span, the network their outputs."""
 
 import numpy as np
 import pytest
@@ -28,8 +28,8 @@ def classes(*rows: list[float]) -> torch.Tensor:
 RISING = classes([0.01, 0.002], [0.02, 0.003], [0.03, 0.006])
 
 
-def test_a_controller_is_table_4_with_its_universes_stretched() -> None:
-    # Spanned by Table 4's own universes, ours is the paper's controller of joint 2.
+def test_controller_is_table_4_with_rescaled_universes() -> None:
+    # With Table 4's own universes, ours is the paper's controller of joint 2.
     paper = paper_controller(2)
     lower, upper = (end * paper.si_factor for end in (paper.lower, paper.upper))
     qd = np.array([[0.0], [float(upper[0])]])
@@ -41,7 +41,7 @@ def test_a_controller_is_table_4_with_its_universes_stretched() -> None:
     torch.testing.assert_close(ours(x[:, 0], x[:, 1]), paper(x[:, 0], x[:, 1]))
 
 
-def test_coefficients_that_fall_with_the_class_mirror_those_that_rise() -> None:
+def test_falling_coefficients_mirror_rising_ones() -> None:
     motion = swing()
     rising = controllers_from_classes(LFM.definition, RISING, motion.qd, motion.qdd)
     falling = controllers_from_classes(LFM.definition, RISING.flip(1), motion.qd, motion.qdd)
@@ -51,7 +51,7 @@ def test_coefficients_that_fall_with_the_class_mirror_those_that_rise() -> None:
 
 
 @pytest.mark.parametrize("name", ["ANCFM", "ALFM", "ANLFM"])
-def test_outputs_lie_within_the_span_of_the_classes(name: str) -> None:
+def test_outputs_are_within_the_span_of_the_classes(name: str) -> None:
     model = model_by_name(name)(3)
     count = len(model.law.coefficients)
     steps = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
@@ -66,7 +66,7 @@ def test_outputs_lie_within_the_span_of_the_classes(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_network_says_what_the_controller_says() -> None:
+def test_network_agrees_with_the_controller() -> None:
     adaptive = model_by_name("ALFM")(3, RISING)
     motion = swing()
     model, fits = papers_neuro_fuzzy(adaptive, [motion], samples=1000)
@@ -74,11 +74,11 @@ def test_the_network_says_what_the_controller_says() -> None:
     assert isinstance(model.schedule, RBFCoefficients)
     assert type(model).__name__ == "NFLFM"
     controllers = controllers_from_classes(model.law, RISING, motion.qd, motion.qdd)
-    # Samples of the motion between those that the network learnt from; it knows no others.
+    # Samples of the motion between the network's training samples; it knows no others.
     qd, qdd = torch.as_tensor(motion.qd[2::4]), torch.as_tensor(motion.qdd[2::4])
     wanted = torch.stack([c(qd[:, j].abs(), qdd[:, j]) for j, c in enumerate(controllers)], 1)
     error = (model.schedule(qd, qdd) - wanted).square().mean(0).sqrt()
-    # The papers' 2-10-2 network errs by 2.5 to 3.1 % of the output range on 40,000 samples.
+    # The error of the papers' 2-10-2 network is 2.5 to 3.1 % of the output range on 40,000 samples.
     assert (error < 0.06 * (wanted.amax(0) - wanted.amin(0))).all()
 
 
@@ -90,13 +90,13 @@ def test_equal_seeds_give_equal_networks() -> None:
         assert torch.equal(a, b)
 
 
-def test_classes_that_agree_still_span_a_universe() -> None:
+def test_equal_classes_still_span_a_universe() -> None:
     motion, brief = swing(1.0), TrainingOptions(search_steps=5, max_steps=5)
     model, _ = papers_neuro_fuzzy(
         model_by_name("ANCFM")(3, [0.02]), [motion], samples=300, options=brief
     )
     qd = torch.as_tensor(motion.qd)
-    # Within the one percent that such a universe is wide.
+    # Within the one percent width of such a universe.
     torch.testing.assert_close(
         model.coefficients(qd, qd), torch.full((*qd.shape, 1), 0.02, dtype=torch.float64),
         rtol=0.006, atol=0.0,

@@ -1,4 +1,4 @@
-"""Tables from results: their arithmetic, and the order that the papers claim."""
+"""Tables from results: their arithmetic, and the order that the papers report."""
 
 import json
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ def entry(error: float | None, split: str) -> dict[str, Any]:
 
 
 def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
-    """Every stage finished, with errors by model (1 by default) on one of two test runs."""
+    """All stages complete, with errors by model (1 by default) on one of two test runs."""
     made = Workspace(folder, QUICK)
     for name in stages():
         names = tables.SECOND_COEFFICIENTS.get(name.removeprefix("rtip-"), {})
@@ -57,13 +57,13 @@ def test_an_error_over_recordings_is_their_root_mean_square(tmp_path: Path) -> N
     np.testing.assert_allclose(train.loc["NCFM"], [9.0, 18.0, 27.0])
 
 
-def test_what_diverged_is_infinitely_wrong(tmp_path: Path) -> None:
+def test_diverged_runs_have_infinite_error(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NFLFM": None})
     assert np.isinf(tables.rmse(made, ["NFLFM"]).to_numpy()).all()
     assert not tables.order(made).holds
 
 
-def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
+def test_table_10_is_compared_with_the_printed_one(tmp_path: Path) -> None:
     made = workspace(tmp_path, {})
     table, measured = tables.table_10(made), tables.table_10(made, "measured_drive")
     assert len(table) == 16
@@ -73,17 +73,17 @@ def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(2 * measured["ours"], table["ours"])
 
 
-def test_table_11_compares_the_best_model_with_each_other_one(tmp_path: Path) -> None:
+def test_table_11_compares_the_best_model_with_every_other(tmp_path: Path) -> None:
     table = tables.table_11(workspace(tmp_path, {"NFNLFM": 0.25}))
     np.testing.assert_allclose(table["ours"], 75.0)
     printed = table["printed"].dropna()
-    # As the paper's text says, 11.56 to 94.55 %.
+    # 11.56 to 94.55 % in the paper's text.
     assert printed.to_numpy().min() == pytest.approx(11.57, abs=0.01)
     assert printed.to_numpy().max() == pytest.approx(94.55, abs=0.005)
     assert list(printed.index) == ["ANCFM", "ALFM", "ANLFM", "NFNCFM", "NFLFM"]
 
 
-def test_tables_6_to_9_are_the_classes(tmp_path: Path) -> None:
+def test_tables_6_to_9_contain_the_classes(tmp_path: Path) -> None:
     made = workspace(tmp_path, {})
     table = tables.table_6(made)
     assert list(table["ours"].loc["joint 3, 1"]) == ["high", 0.0, 7.5]
@@ -96,12 +96,12 @@ def test_tables_6_to_9_are_the_classes(tmp_path: Path) -> None:
 
 
 def test_fits_that_did_not_converge_are_named_at_the_end(tmp_path: Path) -> None:
-    said = page.text(workspace(tmp_path, {})).splitlines()
-    assert "1 of 19 fits did not converge (ALFM)" in said[-1]
-    assert any(line.split() == ["NFLFM-papers", "ended"] for line in said)
+    lines = page.text(workspace(tmp_path, {})).splitlines()
+    assert "1 of 19 fits did not converge (ALFM)" in lines[-1]
+    assert any(line.split() == ["NFLFM-papers", "ended"] for line in lines)
 
 
-def test_what_a_step_saves_within_a_law(tmp_path: Path) -> None:
+def test_improvement_by_each_step_within_a_law(tmp_path: Path) -> None:
     table = tables.steps_saved(workspace(tmp_path, {"NFLFM": 0.25}))
     np.testing.assert_allclose(table["ours"].loc["NFLFM against ALFM"], 75.0)
     np.testing.assert_allclose(table["ours"].loc["ANCFM against NCFM"], 0.0, atol=1e-12)
@@ -110,7 +110,7 @@ def test_what_a_step_saves_within_a_law(tmp_path: Path) -> None:
     np.testing.assert_allclose(table["printed"].loc["NFLFM against ALFM"], expected)
 
 
-def test_the_second_papers_tables(tmp_path: Path) -> None:
+def test_tables_of_the_second_paper(tmp_path: Path) -> None:
     made = workspace(tmp_path, dict.fromkeys(SECOND_PAPER, 3.0))
     for law in LAWS:
         table = tables.second_coefficients(made, law)
@@ -120,7 +120,7 @@ def test_the_second_papers_tables(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
+def test_order_accepts_ties_and_reports_violations(tmp_path: Path, law: str) -> None:
     errors = {law: 3.0, f"A{law}": 2.0, f"NF{law}": 1.0}
     nine = {name: errors.get(name, 2.5) for name in tables.NINE}
     found = tables.order(workspace(tmp_path, nine))
@@ -137,7 +137,7 @@ def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
     assert all(f"A{law}" in text for text in worse.broken)
 
 
-def test_everything_is_written_and_said(tmp_path: Path) -> None:
+def test_everything_is_written_and_printed(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NFNLFM": 0.5, "LFM": None})
     written = page.write_tables(made, command="a command")
     assert all(path.stat().st_size for path in written)
@@ -146,6 +146,6 @@ def test_everything_is_written_and_said(tmp_path: Path) -> None:
     long = pd.read_csv(tmp_path / "rmse.csv")
     # Models, recordings, kinds of error (two drives and one window), joints and all of them.
     assert len(long) == len(EVERY) * 3 * 3 * 4
-    said = page.text(made)
+    text = page.text(made)
     for name in (*tables.NINE, "Table 11", "Table IV", "how the fits ended"):
-        assert name in said
+        assert name in text

@@ -1,4 +1,4 @@
-"""What counts as finished: a whole result of these very settings, and nothing else."""
+"""Only a complete result with the same settings counts as finished."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ def test_a_finished_stage_is_found_again(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, QUICK)
     assert workspace.result("NCFM") is None
     workspace.write_arrays("NCFM", {"q": np.arange(6.0).reshape(2, 3)})
-    assert workspace.result("NCFM") is None  # the arrays alone finish nothing
+    assert workspace.result("NCFM") is None  # the arrays alone are not a finished stage
     workspace.finish("NCFM", {"value": 0.1})
     again = Workspace(tmp_path, replace(QUICK))
     assert again.found("NCFM") == {"value": 0.1}
@@ -25,7 +25,7 @@ def test_a_finished_stage_is_found_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"max_steps": 9}, {"tlrip_seconds": 9.0}])
-def test_other_settings_find_nothing(tmp_path: Path, change: dict) -> None:
+def test_other_settings_have_no_result(tmp_path: Path, change: dict) -> None:
     Workspace(tmp_path, QUICK).finish("NCFM", {})
     other = Workspace(tmp_path, replace(QUICK, **change))
     assert other.result("NCFM") is None
@@ -33,7 +33,7 @@ def test_other_settings_find_nothing(tmp_path: Path, change: dict) -> None:
         other.found("NCFM")
 
 
-def test_half_a_file_is_no_result(tmp_path: Path) -> None:
+def test_partial_file_is_no_result(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, FULL)
     workspace.finish("NCFM", {"value": list(range(100))})
     path = tmp_path / "stages" / "NCFM.json"
@@ -43,15 +43,15 @@ def test_half_a_file_is_no_result(tmp_path: Path) -> None:
         assert workspace.result("NCFM") is None
 
 
-def test_a_result_that_is_not_json_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+def test_result_that_is_not_json_is_refused_without_leftovers(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, FULL)
     with pytest.raises(ValueError, match="JSON"):
         workspace.finish("NCFM", {"value": float("nan")})
     assert not list(tmp_path.rglob("NCFM*"))
 
 
-def test_a_fit_is_read_back_as_it_was_kept(tmp_path: Path) -> None:
-    """Its parts keep their types, as its summary asks for their names."""
+def test_fit_round_trip_is_exact(tmp_path: Path) -> None:
+    """Its parts keep their types, whose names the summary needs."""
     recording = swing(pendulum(), LFM(2), seconds=1.0)
     bench = Bench(pendulum(), [recording], [], smoothed(pendulum(), [recording]), {})
     found = replace(

@@ -1,4 +1,4 @@
-"""Drawn twins: sound physics of every truth, releases that mean something, the same again."""
+"""Random twins: valid physics of every truth, meaningful releases, reproducibility."""
 
 import shlex
 from pathlib import Path
@@ -43,7 +43,7 @@ def drawn() -> twin.Twin:
 # The physics
 
 
-def test_motion_obeys_the_plant(one_second: tuple[str, list[TrueMotion]]) -> None:
+def test_motion_satisfies_the_equation_of_motion(one_second: tuple[str, list[TrueMotion]]) -> None:
     for motion in one_second[1]:
         q, qd, qdd = (torch.from_numpy(x) for x in (motion.q, motion.qd, motion.qdd))
         needed = rigs.tlrip().inverse_dynamics(q, qd, qdd)
@@ -54,7 +54,7 @@ def test_friction_is_passive(one_second: tuple[str, list[TrueMotion]]) -> None:
     truth, found = one_second
     for motion in found:
         power = motion.qd * motion.tau_f
-        # From bristles at rest nothing can be taken out that was not put in.
+        # Bristles at rest cannot return energy that was not put in.
         work = cumulative_trapezoid(power, dx=1e-3, axis=0)
         assert work.min() > -1e-6
         if "bristle" in truth:
@@ -98,7 +98,7 @@ def test_bearings_carry_the_links_weight_and_inertia() -> None:
     np.testing.assert_allclose(hanging, made.at_rest)
 
 
-# What a seed draws
+# Random choices of a seed
 
 
 def test_an_effect_is_the_same_in_every_truth_of_a_seed() -> None:
@@ -123,7 +123,7 @@ def test_releases_are_many_and_differ_by_seed(drawn: twin.Twin) -> None:
         assert np.abs(q0 - other.initial_states[label][0]).max() > 0.01
 
 
-def test_encoders_count(drawn: twin.Twin) -> None:
+def test_encoders_quantise_to_counts(drawn: twin.Twin) -> None:
     for label, recording in drawn.recordings.items():
         counts = recording.q / family.COUNT
         np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
@@ -131,7 +131,7 @@ def test_encoders_count(drawn: twin.Twin) -> None:
 
 
 @pytest.mark.slow
-def test_judged_releases_are_predictable() -> None:
+def test_scored_releases_are_predictable() -> None:
     made = twin.draw("direction", seed=0, duration=2.0)
     motion = family._Motion(Links.of(made.plant), family.parameters("direction", 0))
     starts = np.degrees([made.initial_states[r.name][0] for r in made.part("test")])
@@ -139,7 +139,7 @@ def test_judged_releases_are_predictable() -> None:
     assert growth.max() <= family.PREDICTABLE * family.COUNT
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     for truth in ("glue", "load+load", "plain+load", ""):
         with pytest.raises(ValueError, match="a truth is plain or different ones of load, dir"):
             twin.draw(truth)
@@ -150,7 +150,7 @@ def test_nonsense_is_refused() -> None:
 # Files and results
 
 
-def test_command_writes_what_compare_reads(
+def test_command_writes_files_that_compare_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drawn: twin.Twin
 ) -> None:
     words = ["twin", "--truth", "shear+ripple", "--seed", "1", "--seconds", "0.5"]
@@ -173,7 +173,7 @@ def test_command_writes_what_compare_reads(
     assert "a truth is plain or" in capsys.readouterr().err
 
 
-def test_held_out_errors_as_median_and_pooled() -> None:
+def test_hold_out_errors_are_pooled_and_have_a_median() -> None:
     def score(name: str, error: float) -> Score:
         rmse = RMSE((error,), error)
         return Score(rmse, {}, None, name, np.arange(3.0), np.zeros((3, 1)), np.inf)

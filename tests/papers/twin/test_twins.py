@@ -1,4 +1,4 @@
-"""The twins are what their cards say: sound physics, an honest encoder, the same bytes again."""
+"""The twins match their data cards: valid physics, a realistic encoder, reproducible bytes."""
 
 import math
 import re
@@ -37,18 +37,18 @@ def truth_of(name: str) -> tuple[Links, HiddenFriction]:
 # The truth: mechanics, friction
 
 
-def test_motion_without_friction_is_the_library_s_rollout() -> None:
+def test_frictionless_motion_equals_the_librarys_rollout() -> None:
     plant = rigs.tlrip()
     own = simulate(Links.of(plant), None, SWING, (1.0, -2.0, 3.0), samples=1001)
     start = torch.tensor(SWING, dtype=torch.float64), torch.tensor([1.0, -2.0, 3.0]).double()
     run = rollout(plant, None, *start, steps=1000, substeps=2, gradients=False)
-    # Two implementations of the same steps differ by rounding alone.
+    # Two implementations of the same steps differ only by rounding.
     np.testing.assert_allclose(own.q, run.q, atol=1e-11)
     np.testing.assert_allclose(own.qd, run.qd, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", twin.names())
-def test_motion_with_friction_obeys_the_plant(name: str) -> None:
+def test_motion_with_friction_satisfies_the_equation_of_motion(name: str) -> None:
     links, friction = truth_of(name)
     motion = simulate(links, friction, SWING, samples=400)
     q, qd, qdd = (torch.from_numpy(x) for x in (motion.q, motion.qd, motion.qdd))
@@ -66,7 +66,7 @@ def test_integrator_has_order_four() -> None:
     assert np.all((slopes > 3.7) & (slopes < 4.5)), slopes
 
 
-def test_energy_is_kept_without_friction_and_lost_to_it_with() -> None:
+def test_energy_is_conserved_without_and_dissipated_with_friction() -> None:
     plant = rigs.tlrip()
     links, friction = truth_of("tlrip")
 
@@ -81,13 +81,13 @@ def test_energy_is_kept_without_friction_and_lost_to_it_with() -> None:
     power = np.sum(motion.qd * motion.tau_f, axis=1)
     assert np.all(motion.qd * motion.tau_f >= 0)
     assert np.all(np.diff(left) <= 0)
-    # The trapezoid rule over a few reversals of dry friction is good to a part in a thousand.
+    # The trapezoidal rule over a few reversals of dry friction is accurate to a part in a thousand.
     assert left[0] - left[-1] == pytest.approx(trapezoid(power, dx=1e-3), rel=1e-3)
 
 
 def test_bearings_carry_the_links_weight_and_inertia() -> None:
     rig = rigs.tlrip().to_dict()
-    arm = 1e-9  # so light a friction only reads the force
+    arm = 1e-9  # so light a friction only shows the force
     probe = HiddenFriction(
         seal=(0.0, 0.0, 0.0), bearing_arm=(arm,) * 3, stribeck_rise=(0.0,) * 3,
         stribeck_velocity=(1.0,) * 3, asymmetry=(0.0,) * 3, viscous=(0.0,) * 3,
@@ -103,11 +103,11 @@ def test_bearings_carry_the_links_weight_and_inertia() -> None:
     force = np.array(rig["mass"])[:, None] * acceleration
     carried = np.linalg.norm(np.cumsum(force[:, ::-1], axis=1)[:, ::-1], axis=-1)
     sign = np.tanh(motion.qd / probe.v_smooth)[1:-1]
-    # Second differences at 1 ms leave errors of some 1e-5 of the acceleration.
+    # Second differences at 1 ms have errors of about 1e-5 of the acceleration.
     np.testing.assert_allclose(motion.tau_f[1:-1] / arm, carried * sign, rtol=1e-3, atol=1e-2)
 
 
-def test_friction_has_the_effects_that_the_card_names() -> None:
+def test_friction_has_the_effects_of_its_data_card() -> None:
     _, friction = truth_of("tlrip")
     torque = friction.joint(0)
     dry = replace(friction, viscous=(0.0,) * 3).joint(0)
@@ -128,23 +128,23 @@ def test_a_rig_of_another_kind_is_refused() -> None:
 # The encoder
 
 
-def test_a_perfect_encoder_rounds_to_counts() -> None:
+def test_ideal_encoder_rounds_to_counts() -> None:
     q = np.linspace(-7.0, 7.0, 5003)
     np.testing.assert_allclose(Encoder().read(q), quantise(q, 8192), atol=1e-12)
 
 
-def test_an_imperfect_encoder_counts_up_and_repeats_every_turn() -> None:
+def test_imperfect_encoder_is_monotone_and_periodic() -> None:
     encoder = Encoder.drawn(np.random.default_rng(3))
     q = np.arange(-0.3, 0.3, QUANTUM / 50)
     read = encoder.read(q)
     assert set(np.rint(np.diff(read) / QUANTUM).tolist()) == {0.0, 1.0}
     np.testing.assert_allclose(encoder.read(q + math.tau) - read, math.tau, atol=1e-9)
     widths = np.diff(np.flatnonzero(np.diff(read)))
-    assert np.ptp(widths) > 1  # counts of unequal width: the edges are off
+    assert np.ptp(widths) > 1  # counts of unequal width: misplaced edges
 
 
 @pytest.mark.parametrize("name", twin.names())
-def test_recordings_are_whole_counts_near_the_truth(name: str) -> None:
+def test_recordings_are_integer_counts_near_the_true_motion(name: str) -> None:
     made = twin.make(name, duration=0.5)
     for label, recording in made.recordings.items():
         counts = recording.q / QUANTUM
@@ -158,7 +158,7 @@ def test_recordings_are_whole_counts_near_the_truth(name: str) -> None:
 # The data set
 
 
-def test_a_release_starts_where_it_says(second: twin.Twin) -> None:
+def test_release_starts_at_its_stated_pose(second: twin.Twin) -> None:
     for label, (q0, qd0) in second.initial_states.items():
         np.testing.assert_allclose(second.truth[label].q[0], q0, atol=1e-12)
         np.testing.assert_allclose(second.truth[label].qd[0], qd0, atol=1e-12)
@@ -177,7 +177,7 @@ def test_a_shorter_twin_is_the_beginning_of_a_longer_one(second: twin.Twin) -> N
         assert recording.digest() == second.recordings[label][:200].digest()
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_seed_is_reproducible_to_the_byte(tmp_path: Path) -> None:
     for folder, seed in (("a", 5), ("b", 5), ("c", 6)):
         twin.build("rtip", tmp_path / folder, seed=seed, duration=0.1)
     first, again, other = (
@@ -185,10 +185,10 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     )
     assert first == again
     assert first["train_bent.csv.gz"] != other["train_bent.csv.gz"]
-    assert first["truth.npz"] == other["truth.npz"]  # the seed draws the sensor alone
+    assert first["truth.npz"] == other["truth.npz"]  # the seed affects only the sensor
 
 
-def test_files_give_back_what_was_recorded(tmp_path: Path) -> None:
+def test_file_round_trip_is_exact(tmp_path: Path) -> None:
     made = twin.build("tlrip", tmp_path, duration=0.1)
     table = pd.read_csv(tmp_path / "recordings.csv")
     states = read_initial_states(tmp_path / "recordings.csv")
@@ -203,7 +203,7 @@ def test_files_give_back_what_was_recorded(tmp_path: Path) -> None:
         np.testing.assert_array_equal(truth["test_hanging_tau_f"], made.truth["test_hanging"].tau_f)
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="no twin 'acrobot'; there are tlrip, rtip"):
         twin.make("acrobot")
     with pytest.raises(ValueError, match="`duration` must be at least"):
@@ -215,7 +215,7 @@ def test_nonsense_is_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", twin.names())
-def test_full_twin_dies_out_and_matches_its_card(name: str) -> None:
+def test_full_twin_comes_to_rest_and_matches_its_data_card(name: str) -> None:
     card = (DATASETS / f"{name}_twin" / "README.md").read_text(encoding="utf-8")
     made = twin.make(name)
     for label, recording in made.recordings.items():
@@ -236,22 +236,24 @@ def test_test_motions_are_predictable(name: str) -> None:
 
 
 def build_script(*words: object) -> int:
-    """Run `datasets/build.py` with these words."""
+    """Run `datasets/build.py` with these arguments."""
     main = runpy.run_path(str(DATASETS / "build.py"))["main"]
     return int(main([*map(str, words)]))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
-def test_builder_script(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_builder_script_writes_twins(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert build_script(name, "--out", tmp_path, "--quick") == 0
-    said, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
-    assert re.findall(r"10000 samples", said) == ["10000 samples"] * len(files)
+    printed, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
+    assert re.findall(r"10000 samples", printed) == ["10000 samples"] * len(files)
     assert len(files) == {"experiment_twin": 1, "rtip_twin": 4, "tlrip_controller": 3}[name]
 
 
 @pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
-def test_builder_script_refuses_what_would_spoil_files(
+def test_builder_script_refuses_invalid_outputs_and_seeds(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "train_upright.csv.gz").write_bytes(b"of the twin of the TLRIP")

@@ -1,4 +1,4 @@
-"""How recordings are read as options say, and what a user is told of those that do not fit."""
+"""Options that define how recordings are read, and messages about recordings that do not fit."""
 
 import argparse
 import warnings
@@ -22,7 +22,7 @@ from nfriction.io.model_file import save
 from tests.cli.benches import compare, pendulum, results
 
 
-def test_what_is_not_given_is_left_to_the_fit() -> None:
+def test_omitted_options_keep_the_defaults_of_fit() -> None:
     parser = argparse.ArgumentParser()
     inputs.add_fit_options(parser)
     settings = inputs.fit_settings(parser.parse_args(["--rig", "tlrip"]))
@@ -32,7 +32,7 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     assert f"(default: {','.join(f'{w:g}' for w in DEFAULTS.windows)})" in " ".join(
         parser.format_help().split()
     )
-    told = parser.parse_args(
+    given = parser.parse_args(
         [
             "--rig",
             "tlrip",
@@ -43,14 +43,14 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
             "per_recording",
         ]
     )
-    settings = inputs.fit_settings(told)
+    settings = inputs.fit_settings(given)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
     assert settings["encoder_reference"] == "per_recording"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("absent.csv", None, "check the path"),
         ("empty.csv", b"", "is empty"),
@@ -64,18 +64,18 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("as_test", [False, True])
-def test_files_that_are_no_recordings(
-    bench: Path, failing, name: str, content: bytes | None, said: str, as_test: bool
+def test_files_that_are_not_recordings_are_refused(
+    bench: Path, failing, name: str, content: bytes | None, message: str, as_test: bool
 ) -> None:
     if content is not None:
         (bench / name).write_bytes(content)
     files = [bench / "a.csv.gz", "--test", bench / name] if as_test else [bench / name]
     line = failing("compare", *files, "--rig", bench / "bench.json", "--out", bench / "bad")
-    assert said in line
+    assert message in line
     assert name in line
 
 
-def test_test_recordings_are_unseen(bench: Path, failing) -> None:
+def test_test_recordings_are_not_used_in_the_fit(bench: Path, failing) -> None:
     (bench / "copy.csv.gz").write_bytes((bench / "a.csv.gz").read_bytes())
     for other in ("a.csv.gz", "copy.csv.gz"):
         words = ["compare", bench / "a.csv.gz", "--test", bench / other]
@@ -83,7 +83,7 @@ def test_test_recordings_are_unseen(bench: Path, failing) -> None:
 
 
 def rewritten(bench: Path, folder: Path, change, header: Sequence[str]) -> Path:
-    """The bench with its recordings written in another way, their comments gone."""
+    """The bench with its recordings in another format and without their comments."""
     for name in ("a.csv.gz", "b.csv"):
         table = pd.read_csv(bench / name, comment="#")
         table["q1"] = change(table["q1"])
@@ -103,20 +103,20 @@ def errors(out: Path) -> list[float]:
         (lambda q: np.rad2deg(q + np.pi), ("time", "q1"),
          ["--degrees", "--angles", "relative,upright"]),
         (lambda q: q, ("t", "enc_1"), ["--columns", "time=t, q1=enc_1"]),
-        # A file that says nothing is written as the rig's encoders write.
+        # A file without a convention has that of the rig's encoders.
         (lambda q: q, ("time", "q1"), []),
     ],
 )  # fmt: skip
-def test_options_tell_how_files_are_written(
+def test_options_define_the_file_format(
     bench: Path, compared: Path, tmp_path: Path, change, header, options: list[str]
 ) -> None:
     folder = rewritten(bench, tmp_path, change, header)
     assert compare(folder, folder / "out", *options, "--no-figures") == 0
-    # Degrees and back cost a rounding.
+    # The conversion to degrees and back costs round-off.
     assert errors(folder / "out") == pytest.approx(errors(compared), rel=1e-4)
 
 
-def test_degrees_are_told_once_with_the_option_that_helps(
+def test_degrees_are_reported_once_with_the_option_to_use(
     bench: Path, failing, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = "".join(f"{0.1 * k},{400.5 * k}\n" for k in range(9))
@@ -137,7 +137,7 @@ def test_degrees_are_told_once_with_the_option_that_helps(
     assert second == "nfriction: error: enough"
 
 
-def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> None:
+def test_time_stamps_in_milliseconds_are_reported(bench: Path, capsys, monkeypatch) -> None:
     path = bench / "slow.csv"
     path.write_text("time,q1\n" + "".join(f"{k},{0.1 * k}\n" for k in range(9)))
 
@@ -153,7 +153,7 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "message"),
     [
         ("time,q1,q2,tau2", "no column tau1, so that joint is assumed to be passive; if "
          "it is driven, name it with --columns tau1=NAME."),
@@ -161,8 +161,8 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
          'it with --columns "tau1=torque1".'),
     ],
 )  # fmt: skip
-def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str, said: str
+def test_unread_torque_is_reported_once_with_the_option_to_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str, message: str
 ) -> None:
     rows = "".join(f"{0.01 * k},0.1,0.2,0.3\n" for k in range(9))
     paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
@@ -173,10 +173,10 @@ def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
     arguments = parser.parse_args(["--rig", "multiarm-double"])
     with warnings.catch_warnings():
         inputs.read_recordings(paths, inputs.read_rig("multiarm-double"), arguments)
-    assert capsys.readouterr().err == f"nfriction: warning: a, b: {said}\n"
+    assert capsys.readouterr().err == f"nfriction: warning: a, b: {message}\n"
 
 
-def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Path) -> None:
+def test_robot_description_gives_the_same_result_as_a_rig_file(bench: Path, compared: Path) -> None:
     (bench / "bench.urdf").write_text(
         '<robot name="bench"><link name="wall"/><link name="rod"><inertial>'
         '<origin xyz="0 0 -0.15"/><mass value="0.15"/><inertia ixx="1e-4" iyy="1e-4" '
@@ -190,7 +190,7 @@ def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Pat
     for model in ("NCFM", "LFM"):
         for name, value in ours[model]["coefficients"].items():
             assert value == pytest.approx(theirs[model]["coefficients"][name], rel=1e-9)
-        # The rig file knows the encoder's rounding besides, which weighs the samples of a lead-in.
+        # The rig file also has the encoder resolution, which weights the samples of a lead-in.
         mine, other = (m[model]["test"]["b"]["free_run"]["all"] for m in (ours, theirs))
         assert mine == pytest.approx(other, rel=1e-4)
 
@@ -210,7 +210,7 @@ TAKEN = Law("CVFM", (Coefficient("K", "N m"),), torque)
 
 @pytest.fixture
 def own_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file with a law of one's own, which no other test knows."""
+    """A file with a user-defined law that no other test uses."""
     for name in ("_LAWS", "_MODELS", "_ALL", "_BY_TEXT", "_OWN"):
         monkeypatch.setattr(friction, name, dict(getattr(friction, name)))
     path = tmp_path / "my.py"
@@ -218,7 +218,7 @@ def own_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_a_law_of_ones_own_goes_all_the_way(
+def test_user_defined_law_works_from_fit_to_export(
     bench: Path, own_law: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     models = f"viscous,{own_law}:STICKY"
@@ -238,7 +238,7 @@ def test_a_law_of_ones_own_goes_all_the_way(
 
 
 @pytest.mark.parametrize(
-    ("law", "said"),
+    ("law", "message"),
     [
         ("my.py:STICKI", "has no law STICKI; its laws: STICKY"),
         ("my.py:OTHER", "has no law OTHER"),
@@ -247,16 +247,16 @@ def test_a_law_of_ones_own_goes_all_the_way(
         ("broken.py:STICKY", "broken.py cannot be run: NameError"),
     ],
 )
-def test_a_law_that_cannot_be_used_is_named(
-    law: str, said: str, own_law: Path, failing: Callable[..., str]
+def test_unusable_law_is_named(
+    law: str, message: str, own_law: Path, failing: Callable[..., str]
 ) -> None:
     (own_law.parent / "broken.py").write_text("STICKY = lw\n")
     words = ("a.csv", "--rig", "tlrip", "--model", own_law.parent / law)
     (own_law.parent / "a.csv").touch()
-    assert said in failing("fit", own_law.parent / "a.csv", *words[1:])
+    assert message in failing("fit", own_law.parent / "a.csv", *words[1:])
 
 
-def test_a_model_file_of_an_unknown_law_says_how_to_name_it(
+def test_model_file_of_an_unknown_law_raises_error_with_remedy(
     own_law: Path, tmp_path: Path, failing: Callable[..., str]
 ) -> None:
     (name,) = inputs.models(f"{own_law}:STICKY")
@@ -276,7 +276,7 @@ def test_progress_counts_stages_and_states_the_time(
         progress.expect(3)
         progress.expect(1)
         progress.stage("fit CVFM")
-        assert capsys.readouterr().err == ""  # a run of seconds needs no lines
+        assert capsys.readouterr().err == ""  # no progress lines in a run of a few seconds
         clock[0] = 12.0
         progress.step("2 s windows")
         clock[0] = 15.0
@@ -294,7 +294,7 @@ def test_progress_counts_stages_and_states_the_time(
     ]
 
 
-def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
+def test_fitted_plant_terms_are_printed_in_si() -> None:
     plant = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], armature=[0.01, 0.02])
     plant = plant.replace(armature=torch.tensor([0.01, 0.025]))
     changes = {"inertia 22": 0.0, "gravity 2": 0.0, "armature 2": 0.25, "length 1": 0.1}
@@ -303,16 +303,16 @@ def test_fitted_terms_of_a_plant_are_told_in_si() -> None:
         (), torch.zeros(0),
         intervals=tuple(Interval(n, 0.0, -0.1, 0.1) for n in ("F_c of joint1", *changes)),
     )  # fmt: skip
-    said = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
+    terms = [line.partition("  ")[0] for line in interval_table(fit).splitlines()[2:]]
     assert "complete" not in interval_table(fit)
     doubted = replace(fit, warnings=("The intervals do not cover this.",))
     assert "of CVFM, assuming a complete model (plant" in interval_table(doubted)
     inertia, moment = float(plant.inertia_coupling[1, 1]), float(plant.gravity_moment[1])
-    assert said == [
+    assert terms == [
         "F_c of joint1",
         f"inertia 22 ({inertia:.4g} -> {inertia:.4g} kg m^2)",
         f"gravity 2 ({moment:.4g} -> {moment:.4g} N m)",
         "armature 2 (0.02 -> 0.025 kg m^2)",
         "length 1",
     ]
-    assert fit.to_dict()["names_with_si"]["armature 2"] == said[3]
+    assert fit.to_dict()["names_with_si"]["armature 2"] == terms[3]

@@ -1,4 +1,4 @@
-"""What windows tell is the same however far their states grow, and rounding tells nothing."""
+"""Information in windows survives any growth of their states, and round-off adds none."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -38,7 +38,7 @@ STATE, SHARED = 4, 6
 
 
 def swings(seconds, length, friction, start, recordings=1, **settings):
-    """A search of the law and the plant that made swings, and windows of these."""
+    """Estimation of the law and the plant that generated the swings, and windows of these."""
     law = LFM(2, friction, v_smooth=0.05)
     plant = pendulum()
     made = [
@@ -55,7 +55,7 @@ def swings(seconds, length, friction, start, recordings=1, **settings):
     return search, cut_windows(made, motions, length)
 
 
-def tame(stride=1, **settings) -> ShootingProblem:
+def regular_problem(stride=1, **settings) -> ShootingProblem:
     friction = [[2e-3, 3e-3], [1e-3, 2e-3]]
     search, windows = swings(0.6, 0.2, friction, (1.6, 0.8), recordings=2, **settings)
     start = search.friction.schedule.parameter_vector()
@@ -67,8 +67,8 @@ def error_sizes(p: ShootingProblem) -> torch.Tensor:
     return 2e-4 * (0.5 + torch.rand(p.windows.q.shape, generator=g, dtype=F64))
 
 
-def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
-    """All unknowns' normal equations, and the states marginalize_states from these."""
+def information_from_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
+    """Normal equations of all unknowns, and those with the states marginalised."""
     rows = p.rows(p.simulate(x), p.scale * sd / p.noise_sd)
     covariance = normal_equations(rows, torch.zeros_like(sd), p.variables.indices(), len(x))[1]
     hessian = p.linearise(x).hessian
@@ -77,11 +77,11 @@ def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Informa
 
 @pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=F64)])
 @pytest.mark.parametrize("stride", [1, 3])
-def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd):
-    p = tame(stride, offset_sd=offset_sd)
+def test_rows_and_squares_agree_in_regular_motion(stride, offset_sd):
+    p = regular_problem(stride, offset_sd=offset_sd)
     assert len(p.windows) == 6
     x, sd = p.variables.start(), error_sizes(p)
-    found, expected = gathered_information(p, x, sd), by_squares(p, x, sd)
+    found, expected = gathered_information(p, x, sd), information_from_squares(p, x, sd)
     torch.testing.assert_close(found.prior, expected.prior)
     for name in ("data", "score"):
         one, other = getattr(found, name), getattr(expected, name)
@@ -92,8 +92,8 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd):
 
 
 @pytest.mark.parametrize("piece", [1, 50])
-def test_pieces_do_not_show(piece, monkeypatch):
-    p = tame(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
+def test_result_does_not_depend_on_the_chunks(piece, monkeypatch):
+    p = regular_problem(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
     x, sd = p.variables.start(), error_sizes(p)
     whole = gathered_information(p, x, sd)
     monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
@@ -102,20 +102,20 @@ def test_pieces_do_not_show(piece, monkeypatch):
     torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)
 
 
-def grown(growth, told, seed=0):
-    """A window whose rows, free of its state, have the triangle `told`; both grow alike.
+def window_with_growing_states(growth, factor, seed=0):
+    """A window whose rows, without its state, have the triangular `factor`; both grow together.
 
     Returns:
-        What its rows tell of what is shared, and what their squares do.
+        Information about shared unknowns from its rows, and from their squares.
     """
     g = torch.Generator().manual_seed(seed)
-    shared, size = len(told), len(told) + STATE
+    shared, size = len(factor), len(factor) + STATE
     turn = torch.linalg.qr(torch.randn(300, size, generator=g, dtype=F64)).Q
     states, others = growth * torch.randn(2, STATE, size, generator=g, dtype=F64)
     own, free = turn[:, :STATE], turn[:, STATE:]
-    common = own @ others[:, :shared] + free @ told
+    common = own @ others[:, :shared] + free @ factor
     jacobian = torch.cat([common, own @ states[:, :STATE]], 1)
-    # Of the states so little that it tells nothing of what is shared.
+    # Prior of the states so weak that it adds no information about shared unknowns.
     precision = torch.full((size,), 1e-12, dtype=F64)
     precision[:shared] = 0.0
     kept = Kept(torch.arange(shared, size)[None], STATE, size)
@@ -131,60 +131,61 @@ def triangle(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_told_beside_states_that_grow_is_not_lost(seed):
-    told = triangle(seed)
-    rows, squares = grown(1e12, told, seed)
+def test_information_survives_growing_states(seed):
+    factor = triangle(seed)
+    rows, squares = window_with_growing_states(1e12, factor, seed)
     assert null_directions(NAMES, rows) == ()
-    # In units of the diagonal; rows are rounded to 1e-4 where 1e3 was told, by a state of its own.
-    scale = (told.T @ told).diagonal().rsqrt()
-    difference = scale[:, None] * (rows.data - told.T @ told) * scale
+    # In units of the diagonal; rows are rounded to 1e-4 relative to information of 1e3.
+    scale = (factor.T @ factor).diagonal().rsqrt()
+    difference = scale[:, None] * (rows.data - factor.T @ factor) * scale
     assert float(difference.abs().max()) < 1e-3
-    # Their squares are rounding of 1e8 where 1e6 was told.
+    # Their squares are rounded to 1e8 relative to information of 1e6.
     assert null_directions(NAMES, squares) != ()
 
 
-def test_what_is_not_told_beside_states_that_grow_is_not_claimed():
+def test_growing_states_add_no_spurious_information():
     wrong = 0
     for seed in range(10):
-        told = triangle(seed)
-        told[:, 1] = 2 * told[:, 0]
-        rows, squares = grown(1e12, told, seed)
+        factor = triangle(seed)
+        factor[:, 1] = 2 * factor[:, 0]
+        rows, squares = window_with_growing_states(1e12, factor, seed)
         (direction,) = null_directions(NAMES, rows)
         assert set(direction.split(" with ")) == {"a", "b"}
-        blind = 0 * told
+        blind = 0 * factor
         blind[:, 1:] = triangle(seed)[:, 1:]
-        rows, squares = grown(1e12, blind, seed)
+        rows, squares = window_with_growing_states(1e12, blind, seed)
         assert null_directions(NAMES, rows) == ("a",)
         wrong += float(squares.data[0, 0]) > 1e6
-    # Of the rounding of large squares about half is positive.
+    # Of the round-off of large squares about half is positive.
     assert wrong
 
 
 @pytest.mark.parametrize("growth", [1e20, 1e25])
-def test_rounding_of_rows_tells_nothing(growth):
-    """Beyond what rows can hold, all is lost; none is claimed for the rounding's sake."""
-    rows, _ = grown(growth, triangle(0))
-    told = " with ".join(null_directions(NAMES, rows))
-    assert set(told.split(" with ")) == set(NAMES[:SHARED])
+def test_round_off_of_rows_adds_no_information(growth):
+    """Beyond the precision of rows, all information is lost, and round-off is not taken for any."""
+    rows, _ = window_with_growing_states(growth, triangle(0))
+    directions = " with ".join(null_directions(NAMES, rows))
+    assert set(directions.split(" with ")) == set(NAMES[:SHARED])
 
 
 @pytest.mark.parametrize("growth", [1e16, 4e16, 1e17])
-def test_beside_what_is_lost_no_other_is_told_too_well(growth):
-    """At the edge of what rows can hold some are lost, and the others known with these open."""
+def test_lost_directions_do_not_make_others_overconfident(growth):
+    """At the limit of precision some directions are lost; the others are estimated with these
+    open."""
     kept = too_sure = 0
     for seed in range(60):
-        told = triangle(seed)
-        rows, _ = grown(growth, told, seed)
-        exact = standard_deviations(Information(told.T @ told, torch.zeros(SHARED, dtype=F64)))
+        factor = triangle(seed)
+        rows, _ = window_with_growing_states(growth, factor, seed)
+        exact = standard_deviations(Information(factor.T @ factor, torch.zeros(SHARED, dtype=F64)))
         share = standard_deviations(rows) / exact
         kept += int(share.isfinite().sum())
         too_sure += int((share < 0.9).sum())
     assert kept
-    assert too_sure <= 0.1 * kept  # two in three, were what is lost taken for known
+    assert too_sure <= 0.1 * kept  # two in three, if what is lost were taken as known
 
 
 def in_whole_numbers(rows: np.ndarray, shared: int, precision: list[float]) -> np.ndarray:
-    """Curvature with the last columns marginalize_states, where nothing is rounded."""
+    """Curvature with the last columns marginalised, in exact integer arithmetic."""
     digits = 200
     whole = np.vectorize(lambda v: int(Fraction(v) * 2**digits), otypes=[object])(rows)
     square = np.vectorize(Fraction, otypes=[object])(whole.T @ whole)
@@ -196,15 +197,15 @@ def in_whole_numbers(rows: np.ndarray, shared: int, precision: list[float]) -> n
 
 
 @pytest.mark.filterwarnings("ignore:.*looks like degrees")
-def test_a_chaotic_window_loses_nothing_that_it_tells():
-    """A free swing from upright, the end of which moves by 1e12 times what its start does."""
+def test_chaotic_window_keeps_its_information():
+    """A free swing from upright, whose end moves 1e12 times as far as its start."""
     search, windows = swings(4.0, 4.0, [[3e-4, 6e-4], [3e-4, 3e-4]], (0.02, 0.01))
     start = search.friction.schedule.parameter_vector()
     p = search.problem(windows, 2e-4, start)
     x, count = p.variables.start(), p.variables.shared_count
     g = torch.Generator().manual_seed(0)
     noise = 2e-4 * torch.randn(windows.q.shape, generator=g, dtype=F64)
-    # As if measured from exactly the start that its smoother found.
+    # As if measured from exactly the start that its smoother estimated.
     p = search.problem(
         replace(windows, q=windows.q + p.errors(x) @ search.measurement.inverse().T + noise),
         2e-4, start,
@@ -219,19 +220,19 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     fitted = (lower < upper)[:count]
     index = fitted.nonzero().flatten()
     sd = torch.full_like(errors, p.noise_sd)
-    told = gathered_information(p, x, sd).subset(index)
-    squares = by_squares(p, x, sd).subset(index)
+    gathered = gathered_information(p, x, sd).subset(index)
+    squares = information_from_squares(p, x, sd).subset(index)
     expected = torch.as_tensor(exact)[fitted][:, fitted]
     scale = expected.diagonal().rsqrt()
 
     def error(known: Information) -> float:
         return float((scale[:, None] * (known.data - expected) * scale).abs().max())
 
-    assert error(told) < 1e-3
+    assert error(gathered) < 1e-3
     assert error(squares) > 0.1
 
 
-def test_drawn_errors_give_the_covariance_of_the_gradient() -> None:
+def test_sampled_errors_give_the_covariance_of_the_gradient() -> None:
     """That of independent errors, and twice that if those of two windows are the same."""
     generator = torch.Generator().manual_seed(0)
     one = torch.randn(1, 60, 5, generator=generator, dtype=F64)

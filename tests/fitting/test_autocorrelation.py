@@ -1,4 +1,4 @@
-"""How long errors last, all over and in each stretch of a window."""
+"""Correlation time of residuals, overall and in each segment of a window."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ LEAST_ALIKE = DEFAULTS.min_stationary
 
 
 def lasting(phi: float, samples: int = 4000, windows: int = 20, seed: int = 0) -> torch.Tensor:
-    """Errors of unit size that forget a share 1 - phi of themselves from sample to sample."""
+    """First-order autoregressive errors of unit variance with coefficient phi."""
     g = torch.Generator().manual_seed(seed)
     noise = torch.randn(windows, samples, 1, generator=g, dtype=F64)
     rows = [noise[:, 0]]
@@ -32,15 +32,15 @@ def time_of(phi: float) -> float:
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])
-def test_errors_that_are_alike_count_alike(phi):
-    """Rough in each stretch, but right in all."""
+def test_stationary_errors_have_uniform_weights(phi):
+    """Rough in each segment, but right overall."""
     found = hac_sd(0.3 * lasting(phi), SLOW)
     assert found.shape == (20, 4000, 1)
     assert float(found.square().mean()) == pytest.approx(0.3**2 * time_of(phi), rel=0.12)
 
 
-def test_rounding_makes_up_for_itself_from_count_to_count():
-    """Of a joint that passes a count in 15 samples or so; an error that stays lasts all along."""
+def test_quantisation_is_white_while_a_joint_moves():
+    """For a joint that passes a count in about 15 samples; a constant error lasts all along."""
     speed = torch.linspace(0.9, 1.1, 20, dtype=F64)[:, None, None] / 15.3
     q = speed * torch.arange(4000, dtype=F64)[None, :, None]
     residuals = q.round() - q
@@ -51,18 +51,19 @@ def test_rounding_makes_up_for_itself_from_count_to_count():
     assert float(stays.min()) > 0.3 * (0.5 * 500) ** 0.5
 
 
-def test_a_stretch_where_errors_last_does_not_spoil_the_others():
+def test_correlated_segment_does_not_affect_the_others():
     fast, slow = lasting(0.0), lasting(0.95, seed=1)
     residuals = torch.cat([fast[:, :3000], slow[:, :1000]], 1)
-    # All over, errors seem to last for longer than they do in most of the window.
+    # Overall, errors seem to last longer than they do in most of the window.
     assert correlation_time(residuals) > 5
     found = hac_sd(residuals, SLOW).square()
     assert float(found[:, : 3000 - LEAST_ALIKE].mean()) == pytest.approx(1.0, rel=0.25)
     assert float(found[:, 3000 + LEAST_ALIKE :].mean()) == pytest.approx(time_of(0.95), rel=0.4)
 
 
-def test_errors_that_a_motion_repeats_count_once() -> None:
-    """Twice in one recording at a period of no whole windows, three times in the other."""
+def test_repeated_motion_does_not_add_information() -> None:
+    """Twice in one recording with a period of a non-integer number of windows, thrice in the
+    other."""
     once = lasting(0.5, 2600, 1)[0]
     other = lasting(0.8, 1300, 1, seed=1)[0]
     series = torch.cat([once, once, other, other, other])
@@ -73,20 +74,20 @@ def test_errors_that_a_motion_repeats_count_once() -> None:
     assert float(found) > 1.6 * float(hac_sd(alone, SLOW).square().mean())
 
 
-def test_joints_are_told_apart():
+def test_joints_are_treated_separately():
     residuals = torch.cat([lasting(0.0), 3 * lasting(0.0, seed=1)], -1)
     one, three = hac_sd(residuals, SLOW).square().mean((0, 1)).tolist()
     assert three / one == pytest.approx(9.0, rel=0.05)
 
 
-def test_no_error_at_all_is_as_uncertain_as_errors_elsewhere():
-    """A free start takes over the one error of a joint at rest; it stays as uncertain."""
+def test_zero_residual_gets_the_uncertainty_of_others():
+    """A free start absorbs the one error of a joint at rest; it stays as uncertain."""
     residuals = torch.cat([lasting(0.0, 3000), torch.zeros(20, 1000, 1, dtype=F64)], 1)
     assert float(hac_sd(residuals, SLOW)[:, -1].min()) > 0.8 * LEAST_ALIKE**0.5
     assert not torch.isnan(hac_sd(torch.zeros(2, 300, 1, dtype=F64), SLOW)).any()
 
 
-def test_units_do_not_matter_and_windows_may_be_short():
+def test_result_is_invariant_to_units_and_accepts_short_windows():
     residuals = lasting(0.5, 1000, 3)
     torch.testing.assert_close(hac_sd(7 * residuals, SLOW), 7 * hac_sd(residuals, SLOW))
     assert hac_sd(residuals[:, :50], SLOW).shape == (3, 50, 1)
@@ -95,8 +96,8 @@ def test_units_do_not_matter_and_windows_may_be_short():
 @pytest.mark.parametrize(
     "period", [200, *(pytest.param(longer, marks=pytest.mark.slow) for longer in (500, 700))]
 )
-def test_what_swings_with_the_motion_does_not_make_up_for_itself(period):
-    """Not where the motion's own frequency weighs it."""
+def test_errors_at_the_motion_frequency_do_not_average_out(period):
+    """This concerns the frequency of the motion itself."""
     g = torch.Generator().manual_seed(1)
     time = torch.arange(4000, dtype=F64)[None, :, None] / period
     phase = torch.rand(400, 1, 1, generator=g, dtype=F64)

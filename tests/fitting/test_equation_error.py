@@ -1,4 +1,4 @@
-"""The torque fit is exact on exact torques, and least squares within bounds otherwise."""
+"""The equation-error fit is exact for exact torques, otherwise bounded least squares."""
 
 import math
 
@@ -35,7 +35,7 @@ TRUTH = {
 
 
 def moved(model, plant, *, driven=True):
-    """A motion made up in closed form, and the torques that it takes with this friction."""
+    """A synthetic motion in closed form, and the torques that it takes with this friction."""
     time = np.arange(0, 4, 2e-3)
     w, phase = np.array([3.0, 5.0]), np.array([0.0, 0.7])
     angle = w * time[:, None] + phase
@@ -60,13 +60,13 @@ def test_noiseless_torques_give_the_exact_coefficients(name):
     torch.testing.assert_close(found.torque, rms, rtol=2e-3, atol=0)
 
 
-def test_the_torque_of_a_motion_leaves_the_ends_out():
+def test_torque_of_a_motion_excludes_the_ends():
     plant = pendulum()
     model = model_by_name("LFM")(2, TRUTH["LFM"], v_smooth=V_SMOOTH)
     recording, motion, tau_f = moved(model, plant)
     qd, load, torque = friction_torque(plant, recording, motion)
     inside = (recording.time > EDGE - 1e-9) & (recording.time < recording.time[-1] - EDGE + 1e-9)
-    assert abs(len(torque) - int(inside.sum())) <= 2  # stamps that round to the border
+    assert abs(len(torque) - int(inside.sum())) <= 2  # stamps that round to the edge
     middle = slice(100, 200)
     offset = int(np.flatnonzero(recording.time >= recording.time[0] + EDGE)[0])
     torch.testing.assert_close(
@@ -88,7 +88,7 @@ def test_too_few_samples_are_refused():
             fit_equation_error(law, plant, [recording[:count]], [part])
 
 
-def test_recordings_are_weighed_together_by_their_samples():
+def test_recordings_are_weighted_by_their_samples():
     plant = pendulum()
     models = [model_by_name("NCFM")(2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
     parts = [moved(m, plant) for m in models]
@@ -98,7 +98,7 @@ def test_recordings_are_weighed_together_by_their_samples():
     torch.testing.assert_close(both.coefficients, torch.full((2, 1), 2e-3, dtype=torch.float64))
 
 
-def test_what_is_positive_by_physics_stays_so():
+def test_physically_positive_coefficients_stay_positive():
     plant = pendulum()
     model = model_by_name("NLFM")(2, [-5e-3, 1e-3, 1e-3, 0.0, 1.0], v_smooth=V_SMOOTH)
     recording, motion, _ = moved(model, plant)
@@ -112,20 +112,20 @@ def test_what_is_positive_by_physics_stays_so():
 
 
 @pytest.mark.parametrize(("law", "shy"), [(NONLINEAR, "f_o"), (LINEAR, None)])
-def test_what_joints_have_little_of_is_expected_near_zero_in_units_of_the_friction(law, shy):
+def test_priors_of_small_terms_scale_with_the_friction(law, shy):
     size = torch.tensor([2e-3, 0.5], dtype=torch.float64)
     nothing = torch.zeros(2, len(law.names), dtype=torch.float64)
     sd = prior_sd(law, TorqueFit(nothing, 0.6 * size, size))
     for k, coefficient in enumerate(law.coefficients):
         assert torch.isfinite(sd[:, k]).all() == (coefficient.name == shy)
-        # 0.6 left over and 0.8 explained add in the square.
+        # Residual 0.6 and explained 0.8 add in the square.
         torch.testing.assert_close(sd[:, k], coefficient.prior_scale * 0.8 * size)
     assert (prior_sd(law, TorqueFit(nothing, size, size)) > 0).all()
 
 
-def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
+def test_law_that_returns_nan_is_named_with_joint_and_velocity():
     def root(qd, load, coefficients, v_smooth):
-        return coefficients[..., 0] * qd.sqrt()  # NaN where the joint turns back
+        return coefficients[..., 0] * qd.sqrt()  # NaN at the joint's reversal
 
     plant = pendulum()
     recording, motion, _ = moved(model_by_name("NCFM")(2, TRUTH["NCFM"]), plant)
@@ -134,8 +134,8 @@ def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
         fit_equation_error(law, plant, [recording], [motion], V_SMOOTH)
 
 
-def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
-    """A smoother smears reversals, and with them all that is particular to low speed."""
+def test_friction_that_falls_with_speed_is_found_in_smoothed_torques():
+    """A smoother blurs reversals, and with them all features at low speed."""
     truth = [0.35, 0.15, 0.12, 0.3, 2.0]
     recordings = [flywheel(seed, Stribeck(1, truth)) for seed in (3, 4)]
     found = fit(Stribeck(1), LinearAxis(0.13), recordings, method="equation_error")
@@ -143,16 +143,16 @@ def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
     assert values[:3] == pytest.approx(truth[:3], rel=0.4)
     assert values[0] + values[1] == pytest.approx(0.5, rel=0.15)
     assert 0.15 < values[3] < 0.6
-    told = {i.name: i for i in found.intervals}
-    assert len(told) == 4
-    assert all(i.low < i.value < i.high for i in told.values())
-    # The intervals do not hold that error.
-    assert told["F_d of joint1"].high < 0.15
+    intervals = {i.name: i for i in found.intervals}
+    assert len(intervals) == 4
+    assert all(i.low < i.value < i.high for i in intervals.values())
+    # The intervals do not include that error.
+    assert intervals["F_d of joint1"].high < 0.15
     assert any("blurs friction at low speed" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("alone", [0, -1])
-def test_a_sample_alone_beside_a_gap_does_no_harm(alone):
+def test_single_sample_next_to_a_gap_is_handled(alone):
     recording = flywheel(3, Stribeck(1, [0.35, 0.15, 0.12, 0.3, 2.0]))
     time = recording.time.copy()
     time[alone] += -1.0 if alone == 0 else 1.0
@@ -166,7 +166,7 @@ def test_a_sample_alone_beside_a_gap_does_no_harm(alone):
     )
 
 
-def test_a_regression_names_what_it_found_none_of():
+def test_regression_names_terms_that_are_zero():
     plant = pendulum()
     model = model_by_name("CVFM")(2, [[3e-3, 0.0], [5e-4, 1e-3]], v_smooth=V_SMOOTH)
     recording, motion, _ = moved(model, plant)
@@ -177,8 +177,8 @@ def test_a_regression_names_what_it_found_none_of():
     assert any("smoothed motion" in w for w in found.warnings)
 
 
-def test_coefficients_that_are_not_fitted_keep_the_values_of_the_model():
-    """A linear one of an own law, and the exponent of Stribeck friction."""
+def test_fixed_coefficients_keep_the_values_of_the_model():
+    """A linear one of a user-defined law, and the exponent of Stribeck friction."""
 
     def both(qd, load, coefficients, v_smooth):
         f_c, f_v = coefficients.unbind(-1)

@@ -1,4 +1,4 @@
-"""`fit`, `info` and `export`: from a recording to a model file, what it says, and its artefact."""
+"""`fit`, `info` and `export`: from a recording to a model file, its description and artefact."""
 
 from pathlib import Path
 from typing import Any
@@ -40,36 +40,36 @@ def values(text: str, row: str) -> list[float]:
     return [float(word) for word in found.removeprefix(row).split()]
 
 
-def test_what_fit_prints_next_works(
+def test_next_command_printed_by_fit_works(
     bench: Path, fitted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(fitted)]
     assert cli.main(["fit", str(bench / "a.csv.gz"), *rig, *QUICK]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     model = load(fitted)
     assert isinstance(model, LFM)
     # Four digits are printed.
-    assert values(said, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
-    (command,) = (line for line in said.splitlines() if line.startswith("next: "))
+    assert values(output, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
+    (command,) = (line for line in output.splitlines() if line.startswith("next: "))
     words = command.split()[2:]
     assert cli.main([*words, "--out", str(bench / "x")]) == 0
     assert str(bench / "x" / "m.pt") in capsys.readouterr().out
     torch.jit.load(bench / "x" / "m.pt")
 
 
-def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
+def test_unconverged_fit_is_not_recommended_for_export(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(tmp_path / "m.json")]
     words = ["fit", str(bench / "a.csv.gz"), *rig, *QUICK, "--max-steps", "1"]
     assert cli.main(words) == 0
-    said = capsys.readouterr().out
-    assert "LFM: doubtful (the search did not converge). Not converged" in said
-    assert f"wrote {tmp_path / 'm.json'}" in said
-    assert "next:" not in said
+    output = capsys.readouterr().out
+    assert "LFM: doubtful (the search did not converge). Not converged" in output
+    assert f"wrote {tmp_path / 'm.json'}" in output
+    assert "next:" not in output
 
 
-def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
+def test_unusable_fit_is_exported_with_its_rating(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     time = 0.01 * np.arange(200)
@@ -78,10 +78,10 @@ def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
     words = ["--rig", str(bench / "bench.json"), "--model", "LFM", *QUICK]
     out = ["--out", str(tmp_path / "m.json")]
     assert cli.main(["fit", str(tmp_path / "driven.csv"), *words, *out]) == 0
-    said = capsys.readouterr().out
-    assert "do not use (a mistake in data or rig is likely" in said
-    assert "gains energy" in said
-    assert "next:" not in said
+    output = capsys.readouterr().out
+    assert "do not use (a mistake in data or rig is likely" in output
+    assert "gains energy" in output
+    assert "next:" not in output
     model, rating = str(tmp_path / "m.json"), "do not use: a mistake in data or rig is likely"
     assert cli.main(["info", model]) == 0
     assert f"rating:        {rating}" in capsys.readouterr().out
@@ -90,7 +90,7 @@ def test_a_fit_that_is_not_to_be_used_is_exported_with_its_rating(
     assert f"Rating of the fit: {rating}" in (tmp_path / "m.h").read_text()
 
 
-def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
+def test_model_unsuitable_for_controllers_is_not_recommended_for_export(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def quick(*task: Any, **_: object) -> FitResult:
@@ -107,34 +107,34 @@ def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
         q, tau = run.q.numpy()[::each], force[::each]
         Recording(time[::each], q, tau=tau, unit="m").write(tmp_path / f"{name}.csv")
     out = ["--rig", str(tmp_path / "axis.json"), "--out", str(tmp_path / "m.json")]
-    # A law with memory is advanced by one sample time, and recordings of different ones give none.
+    # A law with memory is advanced by one sample time; recordings with different ones define none.
     for model, names, exportable in (("gear", "a", True), ("dahl", "ab", False)):
         logs = [str(tmp_path / f"{name}.csv") for name in names]
         assert cli.main(["fit", *logs, "--model", model, *out]) == 0
-        said = capsys.readouterr().out
-        assert ("next:" in said) is exportable, said
+        output = capsys.readouterr().out
+        assert ("next:" in output) is exportable, output
 
 
-def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["info", str(fitted)]) == 0
-    said = capsys.readouterr().out
-    model = load(fitted)
-    assert values(said, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
-    for word in ("LFM", "bench", "0.002 s", "rad/s^2", "B [N m s/rad]", "C [N m]", "trained on:"):
-        assert word in said
-
-
-def test_info_of_a_file_that_says_little(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_info_prints_the_contents_of_the_file(
+    fitted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert cli.main(["info", str(fitted)]) == 0
+    output = capsys.readouterr().out
+    model = load(fitted)
+    assert values(output, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
+    for word in ("LFM", "bench", "0.002 s", "rad/s^2", "B [N m s/rad]", "C [N m]", "trained on:"):
+        assert word in output
+
+
+def test_info_of_a_minimal_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = NFLFM(2, [3.0, 4.0])
     save(model, tmp_path / "m.json", ModelInfo(unit="m"))
     assert cli.main(["info", str(tmp_path / "m.json")]) == 0
-    said = capsys.readouterr().out
-    assert "B [N s/m]" in said
-    # An untrained network deviates nowhere from its reference.
-    assert "at rest" not in said
-    assert values(said, "joint2") == pytest.approx([3.0, 4.0])
+    output = capsys.readouterr().out
+    assert "B [N s/m]" in output
+    # An untrained network equals its reference everywhere.
+    assert "at rest" not in output
+    assert values(output, "joint2") == pytest.approx([3.0, 4.0])
 
 
 def test_info_of_many_coefficients_fits_a_terminal(
@@ -143,9 +143,9 @@ def test_info_of_many_coefficients_fits_a_terminal(
     model = model_by_name("slip")(2)
     file = save(model, tmp_path / "slip.json", ModelInfo(sample_time=1e-3))
     assert cli.main(["info", str(file)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for k, coefficient in enumerate(model.law.coefficients):
-        (row,) = (line for line in said.splitlines() if line.startswith(f"{coefficient.name} "))
+        (row,) = (line for line in output.splitlines() if line.startswith(f"{coefficient.name} "))
         shown = [float(word) for word in row.split()[-2:]]
         assert shown == pytest.approx(model.schedule.values[:, k].tolist(), rel=1e-3)
-    assert max(map(len, said.splitlines())) <= 100
+    assert max(map(len, output.splitlines())) <= 100

@@ -1,4 +1,4 @@
-"""A result shows itself: as text, as a table, in a notebook, as a figure."""
+"""Output of a result: text, table, notebook, figure."""
 
 from dataclasses import replace
 
@@ -36,20 +36,20 @@ def test_the_table_has_every_coefficient_with_its_interval(found: FitResult) -> 
     assert not table["note"].any()
 
 
-def test_the_table_notes_what_is_at_a_bound_or_unknown(found: FitResult) -> None:
+def test_table_marks_active_bounds_and_unidentifiable_values(found: FitResult) -> None:
     b, c = found.to_pandas().index
     assert list(replace(found, at_bounds=(b,)).to_pandas()["note"]) == ["at a bound", ""]
     unknown = replace(found, at_bounds=(b,), unidentifiable=(f"{b} with {c}",))
     assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
 
 
-def test_the_table_notes_a_coefficient_that_no_fit_varies(found: FitResult) -> None:
+def test_table_marks_fixed_coefficients(found: FitResult) -> None:
     table = replace(found, model=Stribeck(found.plant.joints), intervals=()).to_pandas()
     assert set(table["note"][["delta" in name for name in table.index]]) == {"not fitted"}
     assert not table["note"][["delta" not in name for name in table.index]].any()
 
 
-def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitResult) -> None:
+def test_collinear_plant_terms_do_not_make_a_fit_doubtful(found: FitResult) -> None:
     b = found.intervals[0].name
     good = replace(found, noise=found.residual, converged=True)
     for unknown, verdict in (
@@ -59,7 +59,7 @@ def test_terms_of_the_rig_that_only_their_sum_shows_leave_a_fit_good(found: FitR
         assert replace(good, unidentifiable=(unknown,)).usability[0] == verdict
 
 
-def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> None:
+def test_coefficients_without_an_interval_show_their_value(found: FitResult) -> None:
     table = replace(found, model=Stribeck(1), intervals=()).to_pandas()
     assert table.index[-1].startswith("delta of ")
     assert table["value"].iloc[-1] == 2.0
@@ -67,7 +67,7 @@ def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> 
 
 
 @pytest.mark.parametrize("kind", [NFLFM, ALFM])
-def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
+def test_motion_dependent_coefficients_name_their_reference_motion(
     found: FitResult, kind: type
 ) -> None:
     model = kind(1, [2.0, 1.5])
@@ -84,12 +84,12 @@ def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
 
 
 def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
-    told = replace(found, warnings=("Too short: 1 < 2.",)).summary()
-    assert told.startswith("load-coulomb (LFM): good. Converged")
-    assert " mN RMS" in told
-    assert f"{found.intervals[0].value:.4g}" in told
-    assert told.endswith("- Too short: 1 < 2.")
-    assert all(line == line.rstrip() for line in told.splitlines())
+    summary = replace(found, warnings=("Too short: 1 < 2.",)).summary()
+    assert summary.startswith("load-coulomb (LFM): good. Converged")
+    assert " mN RMS" in summary
+    assert f"{found.intervals[0].value:.4g}" in summary
+    assert summary.endswith("- Too short: 1 < 2.")
+    assert all(line == line.rstrip() for line in summary.splitlines())
 
 
 def test_a_result_is_printed_in_two_lines(found: FitResult) -> None:
@@ -106,10 +106,10 @@ def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
     assert "<li>Too short: 1 &lt; 2.</li>" in page
 
 
-def test_a_law_of_ones_own_has_a_summary_too(found: FitResult) -> None:
+def test_user_defined_law_has_a_summary_too(found: FitResult) -> None:
     own = replace(laws.VISCOUS, name="grease")
-    told = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
-    assert told.startswith("FrictionModel: good")
+    summary = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
+    assert summary.startswith("FrictionModel: good")
 
 
 def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
@@ -117,7 +117,7 @@ def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
     assert replace(found, model=NCFM(1, [2.0]), intervals=()).plot().axes
 
 
-def test_a_recording_at_rest_has_no_motion_to_judge_by(found: FitResult) -> None:
+def test_residual_larger_than_the_motion_is_doubtful(found: FitResult) -> None:
     motions = tuple(replace(m, q=0.0 * m.q) for m in found.motions)
     for noise in (0.0, 1e-9):
         verdict, reason = replace(found, motions=motions, noise=noise, residual=1e-3).usability

@@ -1,4 +1,4 @@
-"""Stages: their order, and that a run that was killed goes on where it was."""
+"""Stages: their order, and the resumption of a killed run."""
 
 import contextlib
 import os
@@ -41,20 +41,18 @@ TINY = Settings(
 )
 
 
-def test_every_stage_comes_after_those_it_needs() -> None:
+def test_every_stage_follows_its_dependencies() -> None:
     every = {name: stage.needs for name, stage in stages().items()}
-    # Raises where a stage needs itself.
+    # Raises if a stage needs itself.
     assert set(TopologicalSorter(every).static_order()) == set(every)
 
 
-def test_a_stage_waits_for_those_that_it_needs(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_stage_waits_for_its_dependencies(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     done: set[str] = set()
 
     def run(workspace: Workspace, name: str) -> None:
         assert done >= set(stages()[name].needs)
-        time.sleep(0.005)  # others may begin meanwhile
+        time.sleep(0.005)  # others may start meanwhile
         done.add(name)
 
     monkeypatch.setattr(stages_module, "run_stage", run)
@@ -72,24 +70,24 @@ def test_at_least_one_stage_at_a_time(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """A run whose first twin is made."""
+    """A run whose first twin is complete."""
     made = Workspace(tmp_path_factory.mktemp("run"), TINY)
     run_stage(made, "twin-tlrip")
     return made
 
 
-def test_a_constant_model_is_fitted_judged_and_kept(workspace: Workspace) -> None:
+def test_constant_model_is_fitted_scored_and_stored(workspace: Workspace) -> None:
     run_stage(workspace, "NCFM")
     found = workspace.found("NCFM")
     assert {s["split"] for s in found["scores"].values()} == {"train", "test"}
     for score in found["scores"].values():
-        # Constant coefficients do not ask what drives them.
+        # Constant coefficients do not depend on the drive.
         assert score["measured_drive"] == score["free_run"]
         assert max(score["free_run"]["joints"]) < 0.5
     assert workspace.model("NCFM").exists()
 
 
-def test_a_network_that_sees_the_bearing_load_is_judged_on_the_plant_that_knows_it(
+def test_network_with_bearing_load_is_scored_on_a_plant_with_that_load(
     workspace: Workspace,
 ) -> None:
     def load_seen(workspace: Workspace, bench: Bench, name: str) -> Any:
@@ -102,7 +100,7 @@ def test_a_network_that_sees_the_bearing_load_is_judged_on_the_plant_that_knows_
 
 
 def _killed_caller(connection: Connection) -> None:
-    """Tell the process id of a worker, and die without a word to it."""
+    """Report the process id of a worker, and die without stopping it."""
     # Forked, as another import of everything takes seconds; it ends in the same way.
     context = get_context("fork")
     pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_the_caller)
@@ -139,7 +137,7 @@ def _runs(process: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_killed_run_is_resumed(tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(
         "import sys\n"

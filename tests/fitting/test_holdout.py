@@ -1,4 +1,4 @@
-"""A network is kept only where it predicts what it has not seen better than its constant law."""
+"""A network is kept only if it predicts hold-out data better than its constant law."""
 
 from dataclasses import replace
 
@@ -67,21 +67,21 @@ def vector(fitter):
     return fitter.friction.schedule.parameter_vector()
 
 
-def test_every_window_is_held_out_once(constant):
+def test_every_window_is_a_hold_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.1, 100.0):
-        held_back = []
-        for seen, judged in splits(search, motions, length):
-            # Several at a time, so that each lies between others.
-            assert len(judged) >= FOLDS
-            assert not set(seen.spans) & set(judged.spans)
-            held_back += judged.spans
-        samples = [np.arange(first, last) for _, first, last in sorted(held_back)]
+        hold_out = []
+        for train, hold_out_windows in splits(search, motions, length):
+            # Several at a time, so that each lies between training windows.
+            assert len(hold_out_windows) >= FOLDS
+            assert not set(train.spans) & set(hold_out_windows.spans)
+            hold_out += hold_out_windows.spans
+        samples = [np.arange(first, last) for _, first, last in sorted(hold_out)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
 
 
 def test_windows_of_one_recording_count_once(constant, monkeypatch):
-    """They share a search, so that their scatter is not that between recordings."""
+    """They share a search, so their scatter is not that between recordings."""
     joint, found = constant
     validation = object.__new__(Validation)
     validation.options = DEFAULTS
@@ -98,66 +98,66 @@ def test_windows_of_one_recording_count_once(constant, monkeypatch):
 @pytest.mark.parametrize(
     ("errors", "lost"), [([1.1, 1.1, 3.0], True), ([1.1, 3.0], False), ([0.9, 1.1, 3.0], False)]
 )
-def test_a_network_worse_on_every_recording_is_lost(errors, lost):
+def test_network_worse_on_every_recording_is_rejected(errors, lost):
     new = torch.tensor(errors, dtype=F64)
     assert neurofuzzy._worse(torch.ones_like(new), new, 0.05) == lost
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_every_recording_is_held_out_once(constant, count):
+def test_every_recording_is_a_hold_out_once(constant, count):
     joint, found = constant
     windows = holdout_windows([joint] * count, [*found.motions] * count, 0.5, FOLDS)
     held_out = []
-    for seen, judged in recording_splits(windows, FOLDS):
-        places = [{place for place, *_ in part.spans} for part in (seen, judged)]
+    for train, hold_out_windows in recording_splits(windows, FOLDS):
+        places = [{place for place, *_ in part.spans} for part in (train, hold_out_windows)]
         assert set.union(*places) == set(range(count))
         assert not set.intersection(*places)
         held_out += places[1]
     assert sorted(held_out) == list(range(count))
 
 
-def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):
-    """As cross-validation leaves it, which takes blocks out of a recording."""
+def test_short_recording_with_a_gap_still_has_hold_out_windows(constant):
+    """As in cross-validation, which removes blocks from a recording."""
     joint, _ = constant
     samples = np.r_[0:60, len(joint) - 60 : len(joint)]
     gapped = Recording(time=joint.time[samples], q=joint.q[samples])
     assert len(gapped.segments) == 2
     motion = kalman_smoother(gapped.time, gapped.q)
     found = holdout_splits(holdout_windows([gapped], [motion], 100.0, FOLDS), FOLDS)
-    assert all(len(seen) >= 2 and len(held_back) >= 1 for seen, held_back in found)
+    assert all(len(train) >= 2 and len(hold_out) >= 1 for train, hold_out in found)
 
 
-def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant):
+def test_zero_network_has_its_laws_error_and_a_bad_one_a_larger(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5)[0]
+    train, hold_out = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
-    of_law = rmse(held_back, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
+    of_law = rmse(hold_out, law.problem(train, 1e-3, vector(law)), vector(law), NONE)
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         network = torch.full_like(vector(search), value)
-        by_network = search.problem(seen, 1e-3, network)
-        assert least <= rmse(held_back, by_network, network, NONE) / of_law <= most
+        by_network = search.problem(train, 1e-3, network)
+        assert least <= rmse(hold_out, by_network, network, NONE) / of_law <= most
     assert not vector(search).any()
 
 
-def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
-    """A smoother's error at the start says nothing of a law."""
+def test_window_is_scored_from_the_state_that_fits_best(constant):
+    """A smoother's error at the start is no error of the law."""
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5, cut_for_folds)[0]
+    train, hold_out = splits(search, motions, 0.5, cut_for_folds)[0]
     law = replace(search, friction=constant[1].model)
-    problem = law.problem(seen, 1e-4, vector(law))
-    off = replace(held_back, q0=held_back.q0 + 5e-3, qd0=held_back.qd0 - 0.05)
+    problem = law.problem(train, 1e-4, vector(law))
+    off = replace(hold_out, q0=hold_out.q0 + 5e-3, qd0=hold_out.qd0 - 0.05)
     from_off = replace(problem, windows=off)
     unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
     settled = rmse(off, problem, vector(law), NONE)
     assert settled < 0.1 * float(unsettled)
-    assert settled == pytest.approx(rmse(held_back, problem, vector(law), NONE), rel=0.05)
+    assert settled == pytest.approx(rmse(hold_out, problem, vector(law), NONE), rel=0.05)
 
 
-def test_a_network_that_diverges_errs_without_end(constant):
+def test_diverging_network_has_infinite_error(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = splits(search, motions, 0.5)[0]
+    train, hold_out = splits(search, motions, 0.5)[0]
     wild = torch.full_like(vector(search), 1e6)
-    assert rmse(held_back, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
+    assert rmse(hold_out, search.problem(train, 1e-3, wild), wild, NONE) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -170,18 +170,18 @@ def test_a_network_that_diverges_errs_without_end(constant):
         ((0.1, 0.1, 0.1, np.inf), False),
     ],
 )
-def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
+def test_gain_must_exceed_its_scatter_over_windows(ratios, gained):
     law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
     network = law * torch.tensor(ratios, dtype=F64).square()
     assert improves(network, law) is gained
-    # The less chance is left to scatter, the larger has a gain to be.
+    # The more candidates are compared, the larger a gain has to be.
     assert improves(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
     assert improves(network, law, least=1.1) is (gained and max(ratios) < 1 / 1.1)
-    # A law that diverges loses to what does not.
+    # A law that diverges is worse than one that does not.
     assert improves(law, torch.where(law > 3, torch.inf, law))
 
 
-def test_a_model_settles_on_a_coefficient_of_zero(constant):
+def test_law_with_a_zero_coefficient_is_restored(constant):
     search, found = refinement(constant), constant[1]
     zero = replace(found, model=LFM(1, [[0.0, 2e-3]], v_smooth=V_SMOOTH))
     revert_to_constant(search.friction, zero)
@@ -192,14 +192,14 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "told"),
+    ("ratio", "status"),
     [
         pytest.param(1.3, "30 % more than that of its constant law", marks=pytest.mark.slow),
         (0.95, "5 % less than that of its constant law"),
         (np.inf, "diverges"),
     ],
 )
-def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
+def test_rejected_network_is_reset(constant, monkeypatch, ratio, status):
     joint, found = constant
 
     def squares(test, problem, *_):
@@ -213,14 +213,14 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert torch.equal(*(m.schedule.parameter_vector() for m in (kept.model, model)))
-    assert told in kept.status
+    assert status in kept.status
     assert any("constant law" in w for w in kept.warnings)
     qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(14, 1)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_a_law_fitted_to_other_recordings_is_fitted_again(constant):
+def test_law_fitted_to_other_recordings_is_refitted(constant):
     joint, found = constant
     half = joint[: len(joint) // 2]
     kept = fit(
@@ -250,23 +250,23 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
-def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monkeypatch):
+def test_interrupt_during_hold_out_keeps_the_constant_law(constant, monkeypatch):
     joint, found = constant
     cost = ShootingProblem.cost
-    judged = []
+    scored = []
 
     def interrupted(problem, x):
-        if len(problem.windows) == held_back:
-            judged.append(x)
+        if len(problem.windows) == hold_out:
+            scored.append(x)
             raise KeyboardInterrupt
         return cost(problem, x)
 
     search = refinement(constant)
-    held_back = len(splits(search, found.motions, 0.5)[0][1])
+    hold_out = len(splits(search, found.motions, 0.5)[0][1])
     monkeypatch.setattr(ShootingProblem, "cost", interrupted)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
-    assert len(judged) == 1
+    assert len(scored) == 1
     assert torch.equal(*(m.schedule.parameter_vector() for m in (kept.model, model)))
     assert not kept.converged
     assert "Stopped" in kept.status

@@ -1,4 +1,4 @@
-"""Robust losses are SciPy's, and keep spikes of a sensor from changing a fit."""
+"""Robust losses equal SciPy's, and outliers of a sensor hardly change a fit."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ SPIKES = [300, 301, 650, 1111]
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_losses_are_those_of_scipy(loss):
+def test_losses_equal_those_of_scipy(loss):
     errors = torch.tensor([-40.0, -2.0, -0.3, 0.0, 0.7, 1.5, 1e4], dtype=F64)
     ours = RobustLoss(loss, torch.tensor(1.3, dtype=F64))
     theirs = [
@@ -39,7 +39,7 @@ def test_losses_are_those_of_scipy(loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_loss_needs_five_percent_more_samples_of_normal_noise(loss):
+def test_robust_losses_are_95_percent_efficient(loss):
     """Asymptotic efficiency of an M-estimate: E[psi']^2 / E[psi^2]."""
     ours = RobustLoss(loss, torch.tensor(EFFICIENT[loss], dtype=F64))
 
@@ -56,13 +56,13 @@ def test_a_loss_needs_five_percent_more_samples_of_normal_noise(loss):
     assert slope**2 / power == pytest.approx(0.95, abs=1e-3)
 
 
-def test_the_scale_is_that_of_normal_noise_whatever_the_spikes():
+def test_scale_is_that_of_normal_noise_despite_outliers():
     noise = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=F64)
     noise[:, 1] *= 3
     noise[:100] = 1e3
     scale = RobustLoss.of_errors("huber", noise, 0.0).scale / EFFICIENT["huber"]
     torch.testing.assert_close(scale, torch.tensor([1.0, 3.0], dtype=F64), rtol=0.03, atol=0)
-    # Errors of a joint at rest are zero; its scale is the encoder's rounding.
+    # Errors of a joint at rest are zero; its scale is the encoder resolution.
     still = RobustLoss.of_errors("huber", torch.zeros(9, 1, dtype=F64), 0.5)
     assert still.scale.tolist() == [0.5 * EFFICIENT["huber"]]
 
@@ -84,7 +84,7 @@ def test_gradient_is_that_of_the_cost(loss):
         step[k] = 1e-6
         slope = (problem.cost(x + step) - problem.cost(x - step)) / 2e-6
         assert float(local.gradient[k]) == pytest.approx(float(slope), rel=1e-4, abs=1e-3)
-    # All that sums squares of these errors sums the loss.
+    # Every sum of squares of these errors is a sum of the loss.
     squares = replace(problem, loss=SQUARES)
     assert problem.counted_errors(x).square().sum() < squares.counted_errors(x).square().sum()
 
@@ -120,7 +120,7 @@ def test_spikes_hardly_change_a_robust_fit_and_are_named(loss):
     assert {(o.first, o.last) for o in spikes} == {(at[0], at[1]), (at[2], at[2]), (at[3], at[3])}
     assert any("gives less than half weight" in w for w in found.warnings)
     assert found.to_dict()["outliers"][0]["recording"] == "axis"
-    # Residuals are as measured; their root mean square counts as the loss does.
+    # Residuals are as measured; their root mean square uses the loss.
     assert float(found.residuals.abs().max()) > 0.02
     assert found.residual < 0.2 * squares.residual
 

@@ -1,4 +1,4 @@
-"""A stage tells its steps, ends where it creeps, and says so; none loses what was found."""
+"""A stage reports its steps, ends on stalls, and keeps the best result."""
 
 import math
 from dataclasses import replace
@@ -29,26 +29,26 @@ PATIENCE, SETTLED = DEFAULTS.patience, DEFAULTS.settled_move
 
 
 def ends(costs, tolerance=1e-3, least=0.0, damping=10.0):
-    """The status after each step of a search of these costs."""
+    """The status after each step of a search with these costs."""
     _, problem = short_search()
     monitor, x = StallMonitor(problem, tolerance, DEFAULTS, least), problem.variables.start()
     local = problem.linearise(x)
-    # Damped, so that a point that stays is no rest.
+    # Damped, so that a point that does not move is no convergence.
     return [monitor(x, local, Step(cost, damping, 1.0)) for cost in costs]
 
 
-def test_only_a_search_that_creeps_is_ended():
+def test_only_a_stalled_search_is_ended():
     assert not any(ends([0.9**k for k in range(20)]))
     creeping = ends([1.0, 0.5] + [0.4 - 1e-5 * k for k in range(10)])
     assert creeping.index("creeping") == 2 + PATIENCE
     assert not any(creeping[: 2 + PATIENCE])
-    # A cost of errors far below the noise also falls by less than matters.
+    # A cost of errors far below the noise also decreases by less than is significant.
     small = [0.1 * 0.9**k for k in range(8)]
     assert not any(ends(small, least=0.01))
     assert ends(small, least=0.0095, damping=0.1).index("converged_cost") == 2
 
 
-def test_the_caller_hears_every_step_and_may_stop():
+def test_callback_gets_every_step_and_may_stop():
     heard = []
 
     def callback(stage, step):
@@ -61,8 +61,8 @@ def test_the_caller_hears_every_step_and_may_stop():
     assert (ended.stopped, len(heard)) == (True, 2)
 
 
-def test_windows_over_which_noise_of_the_torque_adds_up_are_not_needed():
-    """The best result that such data allow is no matter for a warning."""
+def test_windows_with_accumulated_torque_noise_are_not_needed():
+    """The best result that such data allow raises no warning."""
     recording = flywheel(1, CVFM(1, [0.35, 0.12]), noise=0.03)[:2000]
     found = fit(CVFM(1), LinearAxis(0.13), recording, windows=(0.5, 2.0, 3.0), fit_plant=False)
     assert [length for length, _ in found.stages] == pytest.approx([0.5], rel=0.01)
@@ -86,7 +86,7 @@ def short_search(callback=None):
 
 
 @pytest.mark.parametrize("status", ["creeping", "converged_step"])
-def test_only_a_search_that_settled_claims_convergence(monkeypatch, status):
+def test_only_a_converged_search_reports_convergence(monkeypatch, status):
     monkeypatch.setattr(StallMonitor, "__call__", lambda *_: status)
     search, problem = short_search()
     ended = search.search(problem, problem.variables.start(), 1e-9, "")
@@ -95,8 +95,8 @@ def test_only_a_search_that_settled_claims_convergence(monkeypatch, status):
     assert ended.parts.plant.shape == (0,)
 
 
-def test_what_is_shared_has_settled_once_it_moves_no_more():
-    """Window states may go on; a step that damping cut short is no rest."""
+def test_search_converges_once_shared_parameters_are_stationary():
+    """Window states may still move; a damped step does not count."""
     _, problem = short_search()
     x = problem.variables.start()
     local = problem.linearise(x)
@@ -119,7 +119,7 @@ def test_what_is_shared_has_settled_once_it_moves_no_more():
     assert not settles([x, near, x, near], damping=10.0)
 
 
-def test_a_stage_bears_the_length_that_its_windows_have():
+def test_stage_has_the_length_of_its_windows():
     recording = driven_axis(LinearAxis(0.13), CVFM(1, [0.35, 0.12]), seconds=1.2)
     names = set()
     found = fit(
@@ -130,7 +130,7 @@ def test_a_stage_bears_the_length_that_its_windows_have():
     assert [length for length, _ in found.stages] == [1.2]
 
 
-def test_another_fit_of_a_model_changes_no_earlier_result():
+def test_refit_of_a_model_does_not_change_an_earlier_result():
     model, axis, fast = CVFM(1), LinearAxis(0.13), {"windows": (0.5,), "fit_plant": False}
     first = fit(model, axis, driven_axis(axis, CVFM(1, [0.35, 0.12]), seconds=1.2), **fast)
     before = first.model.schedule.values.clone()
@@ -140,8 +140,8 @@ def test_another_fit_of_a_model_changes_no_earlier_result():
 
 
 @pytest.mark.slow
-def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
-    """Noise of the torque adds up over long windows, and leads their parameters astray."""
+def test_long_windows_keep_the_friction_of_short_ones():
+    """Torque noise accumulates over long windows and biases their parameters."""
     truth = [0.35, 0.15, 0.12, 0.3, 2.0]
     recordings = [flywheel(seed, Stribeck(1, truth)) for seed in (3, 4)]
     found = fit(Stribeck(1), LinearAxis(0.13), recordings)
@@ -157,8 +157,8 @@ def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
     assert not any("Windows" in warning for warning in found.warnings)
 
 
-def test_a_free_swing_keeps_what_short_windows_found():
-    """A law whose error on short windows is the rounding is not given up for a worse one."""
+def test_free_swing_keeps_the_result_of_short_windows():
+    """A law whose error on short windows is the quantisation is not replaced by a worse one."""
     search, problem = short_search()
     found = search.search(problem, problem.variables.start(), 1e-9, "")
     assert found.explained
@@ -172,7 +172,7 @@ def test_a_free_swing_keeps_what_short_windows_found():
     assert loses([found], replace(found, result=replace(found.result, x=wrong)))
 
 
-def test_states_settle_while_the_parameters_stay():
+def test_states_converge_with_fixed_parameters():
     _, problem = short_search()
     start = problem.variables.start()
     settled, stopped = settle_states(problem, start)
@@ -182,7 +182,7 @@ def test_states_settle_while_the_parameters_stay():
     assert problem.cost(settled) < problem.cost(start)
 
 
-def test_a_gain_is_known_as_well_as_its_windows_agree():
+def test_uncertainty_of_a_gain_is_its_scatter_over_windows():
     old = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=F64)
     assert mean_gain(4.0 * old, old) == pytest.approx((-0.6, 0.0), abs=1e-12)
     assert mean_gain(torch.tensor([9.0, 2.0, 3.0, 4.0]), old) == pytest.approx((-0.2, 0.2))
@@ -192,7 +192,7 @@ def test_a_gain_is_known_as_well_as_its_windows_agree():
         assert mean_gain(torch.tensor([diverged, 1.0]), torch.ones(2))[0] == -0.5
 
 
-def test_one_lively_window_does_not_outweigh_many_others():
+def test_one_outlying_window_does_not_outweigh_many_others():
     old, new = torch.tensor([100.0, *[1.0] * 9]), torch.tensor([50.0, *[1.3] * 9])
     assert float(new.sum()) < float(old.sum())
     assert not improves(new, old)
@@ -200,7 +200,7 @@ def test_one_lively_window_does_not_outweigh_many_others():
     assert not improves(0.8 * old, old, least=1.2)
 
 
-def test_a_total_gain_is_that_of_the_sums_that_a_search_minimises():
+def test_total_gain_is_that_of_the_minimised_sums():
     old = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=F64)
     assert total_gain(old / 4.0, old) == pytest.approx((math.log(2.0), 0.0), abs=1e-12)
     lively = torch.tensor([100.0, *[1.0] * 9]), torch.tensor([50.0, *[1.3] * 9])
@@ -209,7 +209,7 @@ def test_a_total_gain_is_that_of_the_sums_that_a_search_minimises():
 
 
 @pytest.mark.parametrize(("scatter", "lost"), [(0.3, False), (0.01, True)])
-def test_a_longer_horizon_is_given_up_for_a_loss_beyond_scatter(scatter, lost, monkeypatch):
+def test_longer_horizon_is_rejected_for_a_significant_loss(scatter, lost, monkeypatch):
     """Its parameters are 17 % worse over short windows, and 13 % better over its own."""
     variables = SimpleNamespace(bounds=lambda: (torch.zeros(2), torch.ones(2)), shared_count=2)
     problem = SimpleNamespace(

@@ -1,4 +1,4 @@
-"""Robot descriptions: the chain moves as MuJoCo says of the same file; what is none is refused."""
+"""Robot descriptions: dynamics equal MuJoCo's for the same file; unsupported files are refused."""
 
 import math
 import re
@@ -73,7 +73,8 @@ def urdf_of(bodies: list[Body], axes: list[np.ndarray], spin: np.ndarray) -> str
 
 
 def random_row(seed: int, joints: int, arm: bool) -> str:
-    """A chain that a `PendulumChain` can be, its frames turned anyhow, as a URDF."""
+    """A random chain that a `PendulumChain` can represent, with arbitrarily rotated frames, as
+    URDF."""
     random = np.random.default_rng(seed)
     turn = Rotation.from_euler("z", random.uniform(-3, 3)).as_matrix()
     axis = turn @ np.array([1.0, 0.0, 0.0])
@@ -95,7 +96,7 @@ def random_row(seed: int, joints: int, arm: bool) -> str:
     for k in range(joints):
         length, angle = random.uniform(0.1, 0.5), random.uniform(-math.pi, math.pi)
         along = math.cos(angle) * up + math.sin(angle) * side
-        # Along the axis a mass may lie anywhere; on the last link beside the line, too.
+        # The mass may lie anywhere along the axis; on the last link also off the line.
         com = anchor + random.uniform(-0.3, 1.2) * length * along + 0.05 * random.normal() * axis
         if k == joints - 1:
             com = com + 0.1 * random.normal() * side
@@ -108,7 +109,7 @@ def random_row(seed: int, joints: int, arm: bool) -> str:
 
 
 def zero_of(plant: PendulumChain) -> np.ndarray:
-    """Joint coordinates of the plant where the file's are zero."""
+    """Joint coordinates of the plant at the file's zero."""
     zero = np.zeros(plant.joints)
     zero[plant.first_link] = math.pi if plant.convention[1] == "hanging" else 0.0
     return zero
@@ -124,14 +125,14 @@ def assert_moves_alike(
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q, qd, tau
         mujoco.mj_forward(model, data)
         found = plant(*(torch.tensor(x) for x in (q + zero_of(plant), qd, tau))).numpy()
-        # Both solve with the mass matrix, whose condition lies below 1e5.
+        # Both solve with the mass matrix, whose condition number is below 1e5.
         assert np.abs(found - data.qacc).max() <= tolerance * max(1.0, np.abs(data.qacc).max())
 
 
 @IN_A_FOLDER
 @given(st.integers(0, 10_000), st.integers(1, 4), st.booleans())
 @example(0, 2, True)
-def test_any_chain_moves_as_mujoco_says(tmp_path, seed, joints, arm):
+def test_dynamics_of_any_chain_equal_those_of_mujoco(tmp_path, seed, joints, arm):
     path = tmp_path / "row.urdf"
     path.write_text(random_row(seed, joints, arm))
     plant = rigs.read(path)
@@ -139,7 +140,7 @@ def test_any_chain_moves_as_mujoco_says(tmp_path, seed, joints, arm):
     assert (plant.name, plant.first_link) == ("row", int(arm))
     model = mujoco.MjModel.from_xml_path(str(path))
     assert_moves_alike(plant, model, seed)
-    # As MuJoCo writes it, with six digits: axes that hardly differ are taken for parallel.
+    # MuJoCo writes six digits, so axes that hardly differ are taken as parallel.
     mujoco.mj_saveLastXML(str(tmp_path / "row.xml"), model)
     saved = mujoco.MjModel.from_xml_path(str(tmp_path / "row.xml"))
     assert_moves_alike(rigs.read(tmp_path / "row.xml"), saved, seed, tolerance=1e-4)
@@ -160,7 +161,7 @@ MJCF = """<mujoco model="bench"><option gravity="0 0 -9.7"/>
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_mjcf_is_read_as_compiled(tmp_path, sign):
+def test_mjcf_is_read_as_compiled_by_mujoco(tmp_path, sign):
     path = tmp_path / "bench.xml"
     path.write_text(MJCF.format(sign=sign))
     plant = rigs.read(path)
@@ -171,7 +172,7 @@ def test_mjcf_is_read_as_compiled(tmp_path, sign):
     assert_moves_alike(plant, model)
 
 
-def test_what_mujoco_warns_of_is_told_and_leaves_no_file(tmp_path, monkeypatch):
+def test_warnings_of_mujoco_are_passed_on_without_a_log_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "bench.xml"
     path.write_text(MJCF.format(sign=1).replace('pos="0.2 0.01 0"', 'pos="NaN 0.01 0"'))
@@ -181,7 +182,7 @@ def test_what_mujoco_warns_of_is_told_and_leaves_no_file(tmp_path, monkeypatch):
     assert [entry.name for entry in tmp_path.iterdir()] == ["bench.xml"]
 
 
-def test_a_file_of_a_known_rig_is_that_rig(tmp_path):
+def test_file_of_a_known_rig_gives_that_rig(tmp_path):
     rig = rigs.multiarm_triple()
     given, place, bodies = rig.to_dict(), np.zeros(3), []
     down, axis = np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])
@@ -195,14 +196,14 @@ def test_a_file_of_a_known_rig_is_that_rig(tmp_path):
     path.write_text(urdf_of(bodies, [axis] * 3, np.eye(3)))
     found = rigs.read(path)
     assert found.convention == ("relative", "hanging")
-    assert "buffers" not in found.to_dict()  # hanging at zero, so nothing is left over
+    assert "buffers" not in found.to_dict()  # hanging at zero, so no offset remains
     ratio = 9.81 / given["gravity"]
     for name, factor in (("inertia_coupling", 1.0), ("gravity_moment", ratio)):
         expected = factor * getattr(rig, name)
         torch.testing.assert_close(getattr(found, name), expected, rtol=1e-12, atol=1e-15)
 
 
-def test_friction_that_we_export_leaves_the_rig_as_it_was(tmp_path):
+def test_exported_friction_does_not_change_the_rig(tmp_path):
     for name, root, text in (
         ("a.urdf", "robot", random_row(3, 2, False)), ("b.xml", "mujoco", MJCF.format(sign=1))
     ):  # fmt: skip
@@ -228,7 +229,7 @@ PENDULUM = """<robot name="p"><link name="base"/><link name="rod"><inertial>
 
 
 @pytest.mark.parametrize("suffix", ["urdf", "xml"])
-def test_endless_names_are_refused_in_few_words(tmp_path, suffix):
+def test_very_long_names_are_refused_in_a_short_message(tmp_path, suffix):
     path = tmp_path / f"bench.{suffix}"
     written = PENDULUM if suffix == "urdf" else MJCF.format(sign=1)
     path.write_text(re.sub(r'(<joint name=)"[^"]*"', r'\1"' + "j" * 1000 + '"', written, count=1))
@@ -273,15 +274,15 @@ ELBOW = '<axis xyz="0 1 0"/><origin xyz="0 0 -0.4"/>'
          "contains macros"),
     ],
 )  # fmt: skip
-def test_what_is_no_chain_is_refused_by_name(tmp_path, old, new, message):
+def test_mechanisms_that_are_no_chain_are_refused_by_name(tmp_path, old, new, message):
     path = tmp_path / "p.urdf"
     path.write_text(PENDULUM)
     rigs.read(path)
     assert old in PENDULUM
     path.write_text(PENDULUM.replace(old, new))
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as caught:
         rigs.read(path)
-    assert str(path) in str(told.value)
+    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -304,7 +305,7 @@ def test_what_is_no_chain_is_refused_by_name(tmp_path, old, new, message):
         ('class="light" from', 'nonsense="1" from', "bench.xml"),
     ],
 )  # fmt: skip
-def test_what_mujoco_knows_beyond_hinges_is_refused(tmp_path, old, new, message):
+def test_elements_other_than_hinges_are_refused(tmp_path, old, new, message):
     path = tmp_path / "bench.xml"
     text = MJCF.format(sign=1)
     assert old in text
@@ -313,19 +314,19 @@ def test_what_mujoco_knows_beyond_hinges_is_refused(tmp_path, old, new, message)
         rigs.read(path)
 
 
-def test_without_mujoco_it_says_what_to_do(tmp_path, monkeypatch):
+def test_without_mujoco_the_error_names_the_package(tmp_path, monkeypatch):
     path = tmp_path / "bench.xml"
     path.write_text(MJCF.format(sign=1))
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match="pip install mujoco"):
         rigs.read(path)
-    path.write_text(PENDULUM)  # a URDF needs none, whatever its ending
+    path.write_text(PENDULUM)  # a URDF needs none, whatever its suffix
     assert rigs.read(path).joint_names == ("top", "elbow")
 
 
 @settings(IN_A_FOLDER, max_examples=60)
 @given(st.data())
-def test_a_spoilt_file_is_a_plant_or_an_error(tmp_path, data):
+def test_damaged_file_gives_a_plant_or_an_error(tmp_path, data):
     start = data.draw(st.integers(0, len(PENDULUM) - 1))
     end = data.draw(st.integers(start, min(start + 30, len(PENDULUM))))
     put = data.draw(st.text('0123456789-.e<>/=" abXYZ\u00e9', max_size=12))

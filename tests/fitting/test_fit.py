@@ -1,4 +1,4 @@
-"""Fits recover what made the recording, say how they ended, and refuse what does not match."""
+"""Fits recover true parameters, report how they ended, and refuse inconsistent input."""
 
 import inspect
 import logging
@@ -58,24 +58,24 @@ def test_known_friction_is_recovered(convention):
     assert_coefficients(found, 0.03)
     assert found.converged
     assert found.status.startswith("Converged")
-    # What is left over is the encoder's rounding, nothing else.
+    # The residual is the encoder's quantisation and nothing else.
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
     assert found.at_bounds == ()
     assert found.plant_terms == ()
 
 
 @pytest.mark.slow
-def test_what_a_wrong_plant_leaves_over_is_told_whether_or_not_the_rig_says_its_count():
+def test_wrong_plant_is_reported_with_and_without_known_resolution():
     # A count is that of the encoder's own angle, which is not the joint's here.
     recording = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=2.0)
     wrong = {"mass": [0.3, 0.2], "length": [0.2, 0.15], "inertia": [2e-3, 1e-3]}
-    told = []
+    residual_warnings = []
     for quantum in (None, 2 * np.pi / 8192):
         plant = PendulumChain(**wrong, position_quantum=quantum)
         found = fit(LFM(2), plant, recording, fit_plant=False, windows=(1.0,))
-        told.append([warning for warning in found.warnings if "Residual:" in warning])
-    assert len(told[0]) == 1
-    assert told[0] == told[1]
+        residual_warnings.append([warning for warning in found.warnings if "Residual:" in warning])
+    assert len(residual_warnings[0]) == 1
+    assert residual_warnings[0] == residual_warnings[1]
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_perturbed_plant_ratios_are_recovered():
     assert len(found.motions) == 2
 
 
-def test_a_driven_axis_gives_mass_and_offset():
+def test_driven_axis_determines_mass_and_offset():
     axis = LinearAxis(2.0, torque_offset=0.3)
     recording = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
     found = fit(LFM(1, v_smooth=V_SMOOTH), LinearAxis(1.9), recording, windows=(0.5,))
@@ -107,7 +107,7 @@ def test_a_driven_axis_gives_mass_and_offset():
 
 
 def test_a_constant_force_is_the_offset_of_a_law_that_has_one():
-    """Beside a term of the plant only their sum would be identifiable."""
+    """With a plant term as well, only their sum would be identifiable."""
     truth = LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)
     recording = driven_axis(LinearAxis(2.0, torque_offset=0.3), truth)
     found = fit(NLFM(1, v_smooth=V_SMOOTH), LinearAxis(1.9), recording, windows=(0.5,))
@@ -117,7 +117,7 @@ def test_a_constant_force_is_the_offset_of_a_law_that_has_one():
 
 
 @pytest.mark.parametrize(("mass", "viscous", "v_smooth"), [(20.0, 20.0, 2e-5), (0.02, 0.05, 1e-3)])
-def test_the_sign_of_a_named_model_suits_speeds_and_steps(mass, viscous, v_smooth):
+def test_regularisation_velocity_fits_speeds_and_sample_time(mass, viscous, v_smooth):
     """A heavy axis moves at 6 cm/s; friction stops a light one within a few samples."""
     axis, truth = LinearAxis(mass), CVFM(1, [4.0, viscous], v_smooth=v_smooth)
     recording = driven_axis(axis, truth, substeps=300, seconds=2.0)
@@ -129,7 +129,7 @@ def test_the_sign_of_a_named_model_suits_speeds_and_steps(mass, viscous, v_smoot
     assert found.model.schedule.values[0].tolist() == pytest.approx([4.0, viscous], rel=0.01)
 
 
-def test_a_joint_that_friction_holds_creeps_by_less_than_the_noise():
+def test_joint_held_by_friction_creeps_by_less_than_the_noise():
     time = np.arange(0.0, 4.0, 2e-3)
     reference = np.clip(np.sin(2 * np.pi * 0.5 * time), -0.8, 0.8)  # rests of 0.41 s
     q = 1e-3 * np.rint(reference[:, None] / 1e-3)
@@ -140,10 +140,10 @@ def test_a_joint_that_friction_holds_creeps_by_less_than_the_noise():
     assert 0.3 * noise < 0.4 * found <= noise
 
 
-def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
-    """Only their sum shows; either alone may be anything, and the verdict says so."""
+def test_single_speed_makes_viscous_and_coulomb_unidentifiable():
+    """Only their sum is identifiable; either alone may have any value, and the warning says so."""
     axis, truth = LinearAxis(2.0), LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)
-    # Not a whole number of micrometres to a sample.
+    # Not an integer number of micrometres per sample.
     speed = torch.full((1,), 0.5123, dtype=F64)
     force = torch.full((1000, 1), 3.0 * 0.5123 + 1.0, dtype=F64)
     out = rollout(axis, truth, 0 * speed, speed, force, sample_time=2e-3, substeps=2,
@@ -152,16 +152,17 @@ def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
     q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
     recording = Recording(out.time.numpy(), q, tau=tau, unit="m", name="steady")
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5, 1.0), fit_plant=False)
-    (lost,) = found.unidentifiable
-    assert set(lost.split(" with ")) == {"B of joint1", "C of joint1"}
+    (direction,) = found.unidentifiable
+    assert set(direction.split(" with ")) == {"B of joint1", "C of joint1"}
     assert any("Not identifiable" in warning for warning in found.warnings)
     assert all(i.high - i.low > i.value for i in found.intervals)
     viscous, coulomb = found.model.schedule.values[0].tolist()
     assert 0.5123 * viscous + coulomb == pytest.approx(3.0 * 0.5123 + 1.0, rel=0.01)
 
 
-def test_a_joint_that_hardly_moves_is_named_as_lost():
-    """It creeps in the smooth sign's passage, where viscous and Coulomb friction look alike."""
+def test_joint_that_hardly_moves_is_named_as_unidentifiable():
+    """It creeps in the smooth sign's transition, where viscous and Coulomb friction are
+    equivalent."""
     truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 0.1]], v_smooth=V_SMOOTH)
     recording = swing(pendulum(), truth, start=(np.pi - 0.5, 0.0), seconds=3.0)
     assert np.ptp(recording.q[:, 1]) < 0.01
@@ -171,39 +172,39 @@ def test_a_joint_that_hardly_moves_is_named_as_lost():
     assert {"B of joint2", "C of joint2"} <= set(
         " with ".join(found.unidentifiable).split(" with ")
     )
-    told = {i.name: i for i in found.intervals}
-    assert told["C of joint2"].high - told["C of joint2"].low > 0.1
+    intervals = {i.name: i for i in found.intervals}
+    assert intervals["C of joint2"].high - intervals["C of joint2"].low > 0.1
     for name, true in (("B of joint1", 1.5e-3), ("C of joint1", 2.5e-3)):
         assert name not in found.unidentifiable
-        assert told[name].value == pytest.approx(true, rel=0.05)
+        assert intervals[name].value == pytest.approx(true, rel=0.05)
 
 
-def test_an_asymmetric_axis_is_told_from_its_offset():
+def test_asymmetric_friction_is_separated_from_an_offset():
     axis = LinearAxis(2.0, torque_offset=0.3)
     crooked = axis.replace(asymmetry=torch.tensor([0.8], dtype=F64))
     recording = driven_axis(crooked, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
     assert float(found.plant.asymmetry) == pytest.approx(0.8, rel=0.1)
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
-    (told,) = (w for w in found.warnings if "times the speed" in w)
-    assert "a drive force of -0." in told
-    assert "larger forwards" in told
+    (warning,) = (w for w in found.warnings if "times the speed" in w)
+    assert "a drive force of -0." in warning
+    assert "larger forwards" in warning
     assert not any("constant drive" in w for w in found.warnings)
 
 
-def test_a_weight_on_an_axis_is_no_asymmetry_of_its_friction():
+def test_weight_on_an_axis_is_not_asymmetric_friction():
     """Its drive carries the weight, which the rig lacks."""
     axis = LinearAxis(2.0)
     level = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
     recording = replace(level, tau=level.tau + 20.0)
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
     assert float(found.plant.torque_offset) == pytest.approx(-20.0, rel=0.01)
-    (told,) = (w for w in found.warnings if "constant drive force" in w)
-    assert "is larger than its friction: a weight, a spring, or a sensor's bias" in told
-    assert "larger forwards" not in told
+    (warning,) = (w for w in found.warnings if "constant drive force" in w)
+    assert "is larger than its friction: a weight, a spring, or a sensor's bias" in warning
+    assert "larger forwards" not in warning
 
 
-def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
+def test_drag_is_fitted_by_default_for_free_swings():
     recording = swing(pendulum(), true_model(), seconds=1.0)
 
     def drag(**more):
@@ -216,8 +217,8 @@ def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
 
 
 @pytest.mark.slow
-def test_air_drag_is_told_from_joint_friction():
-    """With drag in the recording, joint coefficients mean joints only where drag is fitted."""
+def test_air_drag_is_separated_from_joint_friction():
+    """With drag in the recording, joint coefficients are unbiased only if drag is fitted."""
     plant = pendulum()
     air = plant.replace(drag_quadratic=torch.full((2,), 0.05, dtype=F64))
     recording = swing(air, true_model(), seconds=6.0)
@@ -227,22 +228,22 @@ def test_air_drag_is_told_from_joint_friction():
         truth = torch.tensor(TRUTH, dtype=F64)
         errors.append(float((found.model.schedule.values / truth - 1).abs().max()))
         if drag:
-            told = {i.name: i for i in found.intervals}["drag quadratic"]
-            assert told.low < 0.05 < told.high
+            interval = {i.name: i for i in found.intervals}["drag quadratic"]
+            assert interval.low < 0.05 < interval.high
             assert {"intervals", "unidentifiable", "warnings"} <= found.to_dict().keys()
     assert errors[0] < 0.2 * errors[1]
 
 
 @pytest.mark.slow
-def test_windows_that_are_left_out_are_told(monkeypatch):
+def test_skipped_windows_are_reported(monkeypatch):
     monkeypatch.setattr(HorizonResult, "lost_motion", lambda self, before, options: True)
     recording = swing(pendulum(), true_model(), seconds=2.0)
     found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=3)
-    assert sum(told.startswith("Windows of 1 s were skipped") for told in found.warnings) == 1
+    assert sum(warning.startswith("Windows of 1 s were skipped") for warning in found.warnings) == 1
     alone = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=3)
-    assert not any("were skipped" in told for told in alone.warnings)
+    assert not any("were skipped" in warning for warning in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
-    # Whatever starts there says it, too.
+    # Every fit that starts there repeats the warning.
     monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     for kept in (False, True):
         monkeypatch.setattr(
@@ -250,8 +251,8 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         )
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
-        assert sum("were skipped" in told for told in further.warnings) == 1
-    # A network is not to follow what its law could not.
+        assert sum("were skipped" in warning for warning in further.warnings) == 1
+    # A network must not follow what its law could not.
     assert found.skipped_horizons == (1.0,)
     assert fit(network, pendulum(), recording, start=found, max_steps=2).skipped_horizons == (1.0,)
     stages = set()
@@ -265,17 +266,17 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0, 1.5), max_steps=3
     )
     assert later.skipped_horizons == (1.0, 1.5)
-    assert sum("Windows of 1 and 1.5 s were skipped" in told for told in later.warnings) == 1
+    assert sum("Windows of 1 and 1.5 s were skipped" in warning for warning in later.warnings) == 1
 
 
-def test_irregular_stamps_are_followed():
+def test_irregular_time_stamps_are_simulated():
     step = np.random.default_rng(0).uniform(1e-3, 3e-3, 1500)
     recording = swing(pendulum(), true_model(), sample_time=step)
     found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(1.0,))
     assert_coefficients(found, 0.05)
 
 
-def test_a_torque_fit_stops_there_and_starts_another():
+def test_equation_error_fit_can_start_another_fit():
     recording = swing(pendulum(), true_model(), seconds=2.0)
     first = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="equation_error")
     assert first.steps == 0
@@ -308,7 +309,7 @@ def test_terms_of_an_earlier_fit_are_taken_by_name():
     assert less.plant_terms == ()
 
 
-def test_a_stop_keeps_what_was_reached():
+def test_early_stop_keeps_the_best_result():
     recording = swing(pendulum(), true_model(), seconds=2.0)
     seen = []
 
@@ -326,7 +327,7 @@ def test_a_stop_keeps_what_was_reached():
 
 
 @pytest.mark.slow
-def test_a_neuro_fuzzy_model_with_little_data_stays_near_its_constant_law():
+def test_neuro_fuzzy_model_with_little_data_is_near_its_constant_law():
     recording = swing(pendulum(), true_model(), seconds=1.5)
     constant = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False)
     model = NFLFM(2, v_smooth=V_SMOOTH)
@@ -354,7 +355,7 @@ def test_effective_noise_of_white_and_of_correlated_residuals():
     assert effective_noise(10 * ar) == pytest.approx(10 * effective_noise(ar))
 
 
-def test_what_does_not_match_is_refused():
+def test_inconsistent_input_is_refused():
     recording = swing(pendulum(), true_model(), seconds=0.5)
     other = swing(pendulum(), true_model(), seconds=0.5, convention="absolute,hanging", name="o")
     for arguments, message in (
@@ -380,14 +381,14 @@ def test_what_does_not_match_is_refused():
 @pytest.mark.parametrize(
     "setting", [{"fit_plant": "no"}, {"drag": "no"}, {"fit_delay": 2}, {"max_steps": 2.5}]
 )
-def test_a_setting_of_another_kind_is_refused(setting):
-    """Not taken for true, or for the whole number below."""
+def test_settings_of_wrong_type_are_refused(setting):
+    """They are neither taken as true nor rounded down."""
     (name,) = setting
     with pytest.raises(ValueError, match=rf"`{name}` must be .*, got "):
         fit(LFM(2), pendulum(), swing(pendulum(), true_model(), seconds=0.5), **setting)
 
 
-def test_a_constant_fit_that_others_ask_for_has_the_defaults_of_fit():
+def test_internal_constant_fit_has_the_defaults_of_fit():
     offered = inspect.signature(fit).parameters
     defaults = {f.name: f.default for f in fields(FitOptions)}
     own = {"model", "plant", "recordings", "start", "motions", "callback"}
@@ -406,43 +407,43 @@ def test_motions_must_be_those_of_the_recordings(model):
             fit(model(2), pendulum(), recordings, motions=motions)
 
 
-def test_recordings_without_torque_beside_driven_ones_are_named():
+def test_recordings_without_torque_among_driven_ones_are_named():
     free, other = (swing(pendulum(), true_model(), seconds=0.5, start=s, name=n)
                    for s, n in (((1.6, 0.8), "free"), ((2.0, 0.2), "other")))  # fmt: skip
     torque = replace(other, tau=np.full_like(other.q, 1e-3), name="driven")
     for recordings in ([free, torque], [torque, free]):
-        with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as said:
+        with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as caught:
             fit(LFM(2), pendulum(), recordings, method="equation_error")
-        assert len([w for w in said if "no torque" in str(w.message)]) == 1
+        assert len([w for w in caught if "no torque" in str(w.message)]) == 1
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="no torque is recorded")
-        for alike in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
-            fit(LFM(2), pendulum(), alike, method="equation_error")
+        for pair in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
+            fit(LFM(2), pendulum(), pair, method="equation_error")
 
 
-def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
+def test_plain_fit_logs_no_warnings(caplog):
     recording: Recording = swing(pendulum(), true_model(), seconds=1.0)
     with caplog.at_level(logging.WARNING, "nfriction"):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(0.5,))
     assert not caplog.records
 
 
-def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
+def test_convention_of_the_recording_precedes_that_of_the_plant():
     hanging = pendulum(convention=("absolute", "hanging"))
-    said = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=1.0)
-    unsaid = replace(said, convention=None)
+    stated = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=1.0)
+    unstated = replace(stated, convention=None)
     settings = {"fit_plant": False, "windows": (0.5,), "max_steps": 3}
     found = [
         fit(LFM(2, v_smooth=V_SMOOTH), plant, recording, **settings)
-        for plant, recording in ((hanging, unsaid), (pendulum(), said))
+        for plant, recording in ((hanging, unstated), (pendulum(), stated))
     ]
     assert torch.equal(found[0].model.schedule.values, found[1].model.schedule.values)
     assert found[0].residual == found[1].residual
     with pytest.raises(ValueError, match=r"absolute,hanging and relative,upright"):
-        fit(LFM(2), pendulum(), [said, unsaid])
+        fit(LFM(2), pendulum(), [stated, unstated])
 
 
-def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
+def test_fitted_model_requires_no_gradients_and_may_be_refitted():
     plant = one_link()
     recording = swing(plant, LFM(1, TRUTH[:1], v_smooth=V_SMOOTH), seconds=0.5)
     model = LFM(1, v_smooth=V_SMOOTH)
@@ -460,7 +461,7 @@ def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
         assert not any(p.requires_grad for p in bent.parameters())
 
 
-def test_a_method_that_is_none_is_named():
+def test_unknown_method_is_named():
     recording = swing(pendulum(), true_model(), seconds=0.5)
     with pytest.raises(
         ValueError, match=r"one of \('equation_error', 'output_error'\), got 'torqe'"
@@ -469,7 +470,7 @@ def test_a_method_that_is_none_is_named():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (lambda m, p, r: (LFM, p, r), "`model` must be a friction model .*LFM"),
         (lambda m, p, r: (m, r, p), "`plant` must be a mechanism"),
@@ -477,15 +478,15 @@ def test_a_method_that_is_none_is_named():
         (lambda m, p, r: (m, p, 5), "a recording is a Recording, the path"),
     ],
 )
-def test_what_is_something_else_is_told(arguments, told):
+def test_wrong_argument_types_are_named(arguments, message):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
-    with pytest.raises(TypeError, match=told):
+    with pytest.raises(TypeError, match=message):
         fit(*arguments(LFM(2), pendulum(), recording))
     with pytest.raises(TypeError, match="`start` must be the result of a fit, got a LFM"):
         fit(LFM(2), pendulum(), recording, start=LFM(2))
 
 
-def test_names_paths_and_tables_are_taken_as_what_they_name(tmp_path):
+def test_names_paths_and_tables_are_accepted(tmp_path):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.5)
     recording.write(tmp_path / "run.csv")
     rigs.write(pendulum(), tmp_path / "rig.json")
@@ -506,8 +507,8 @@ POOR = [[3e-3, 0.0, 1e-4, 20.0, 2.0]] * 2
 
 
 @pytest.fixture
-def misled(monkeypatch):
-    """Torques that tell nonsense of a law, the first time that they are asked."""
+def misled_searches(monkeypatch):
+    """Make the first equation-error fit of a law return useless coefficients."""
     asked = []
 
     def by_torque(law, plant, *rest):
@@ -523,18 +524,18 @@ def misled(monkeypatch):
 
 
 @pytest.mark.slow
-def test_stribeck_friction_is_found_again():
+def test_stribeck_friction_is_recovered():
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=3.0)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
-    # What is left over is the encoder's rounding.
+    # The residual is the encoder's quantisation.
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.02)
     truth = torch.tensor(FALLING, dtype=F64)
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
 
 
 @pytest.mark.slow
-def test_no_search_is_made_twice(monkeypatch):
-    """On a plant that is not fitted, torques lead again to where the search began."""
+def test_no_search_is_repeated(monkeypatch):
+    """With a fixed plant, equation error leads to the same start as before."""
     begun, search = [], ShootingFitter.search
 
     def counted(fitter, problem, start, *rest):
@@ -542,7 +543,7 @@ def test_no_search_is_made_twice(monkeypatch):
         return search(fitter, problem, start, *rest)
 
     monkeypatch.setattr(ShootingFitter, "search", counted)
-    # Another law's friction, so that the encoder's rounding does not end the restarts.
+    # Friction of another law, so that the encoder's quantisation does not end the restarts.
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=1.0)
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 1}
     fit(NLFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
@@ -551,7 +552,7 @@ def test_no_search_is_made_twice(monkeypatch):
 
 
 @pytest.mark.slow
-def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
+def test_stribeck_friction_is_recovered_despite_a_wrong_plant():
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
     given = PendulumChain([0.27, 0.22], [0.2, 0.15], inertia=[1.5e-3, 4e-4])
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), given, recording, windows=(0.5, 2.0))
@@ -559,24 +560,22 @@ def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
 
 
 def mine(joints, **settings):
-    """A law of one's own that does not say what it contains."""
+    """A user-defined law that does not declare its nested law."""
     law = replace(STRIBECK, name="mine", nested_law=None, nested_coefficients=())
     return FrictionModel(law, Constant(law, joints), **settings)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [Stribeck, mine])
-def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
-    misled, monkeypatch, law
-):
+def test_misled_law_restarts_from_the_fitted_plant(misled_searches, monkeypatch, law):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
 
     def fitted():
-        misled.clear()
+        misled_searches.clear()
         return fit(law(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
 
     found = fitted()
-    assert misled[1] is not misled[0]
+    assert misled_searches[1] is not misled_searches[0]
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
     better = "nfriction.fitting.strategy.continuation.restart_from_equation_error"
     monkeypatch.setattr(better, lambda fitter, found, *rest: found)
@@ -587,7 +586,7 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
 
 
 @pytest.mark.slow
-def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkeypatch):
+def test_failed_search_from_the_nested_law_keeps_the_model(monkeypatch):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
     settings = {"windows": (0.5, 1.0), "fit_plant": False}
     simpler = []
@@ -613,8 +612,8 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", [Stribeck, NLFM])
-def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
-    """However badly torques mislead it."""
+def test_residual_is_at_most_that_of_the_nested_law(law, monkeypatch):
+    """However poor the start from equation error is."""
 
     def by_torque(law, plant, *rest):
         found = fit_equation_error(law, plant, *rest)
@@ -629,7 +628,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
         for of in (CVFM, law)
     )
     assert found.residual <= 1.001 * simpler.residual
-    # Its own search lost track of all windows, and so left the longer ones out.
+    # Its own search diverged in all windows, and so skipped the longer ones.
     assert not any("were skipped" in warning for warning in found.warnings)
 
 
@@ -637,31 +636,31 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
 @pytest.mark.parametrize(
     "last", ["0.5 s windows, coulomb_viscous law", "from the coulomb_viscous law"]
 )
-def test_what_stops_a_further_search_stops_the_fit_and_keeps_the_best(last):
+def test_interrupt_of_a_further_search_keeps_the_best_fit(last):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     alone = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
-    told = []
+    stages = []
 
     def stop(stage, step):
-        told.append(stage)
+        stages.append(stage)
         return stage == last
 
     model = Stribeck(2, v_smooth=V_SMOOTH)
     found = fit(model, pendulum(), recording, windows=(0.5,), callback=stop)
-    assert told[0] == "0.5 s windows"
-    assert told.count(last) == 1
+    assert stages[0] == "0.5 s windows"
+    assert stages.count(last) == 1
     assert not found.converged
     assert "Stopped" in found.status
     assert found.residual < alone.residual
 
 
-def test_a_law_that_contains_no_simpler_one_is_searched_once(misled):
+def test_law_without_a_nested_law_is_searched_once(misled_searches):
     fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), swing(pendulum(), true_model(), seconds=1.0),
         windows=(0.5,), max_steps=1)  # fmt: skip
-    assert len(misled) == 1
+    assert len(misled_searches) == 1
 
 
-def test_what_ends_at_zero_is_told_as_none_of_it():
+def test_coefficient_at_zero_is_reported_as_absent():
     truth = LFM(2, [[0.0, 2e-3], [0.0, 1e-3]], v_smooth=0.05)
     recording = swing(pendulum(), truth, seconds=3.0)
     found = fit(LFM(2, v_smooth=0.05), pendulum(), recording, windows=(0.5,), max_steps=10)

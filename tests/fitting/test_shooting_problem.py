@@ -1,4 +1,4 @@
-"""The quadratic model of a trajectory problem is the derivative of its cost."""
+"""The quadratic model of a shooting problem matches the derivatives of its cost."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def problem(model, substeps=2, stride=1, **settings) -> ShootingProblem:
 
 
 def bent(name):
-    """A model with coefficients away from the truth, the network's away from zero."""
+    """A model with coefficients different from the true ones, and a nonzero network."""
     if name == "LFM":
         return LFM(2, [5e-3, 2e-3], v_smooth=0.1)
     model = NFLFM(2, [5e-3, 2e-3], v_smooth=0.1, terms=(2, 2), head_units=2)
@@ -66,7 +66,7 @@ def point(p: ShootingProblem) -> torch.Tensor:
 
 
 def residuals(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
-    """Errors of the counted samples over the noise, (window, step + 1, joint)."""
+    """Weighted errors of the used samples, (window, step + 1, joint)."""
     return p.deviation(x, p.simulate(x)) * p.scale
 
 
@@ -77,7 +77,7 @@ def misfit(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
 OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
 
 
-# Both are there in some cases, so that columns of a network and of offsets cannot be confused.
+# Some cases have both, so that columns of a network and of offsets cannot be confused.
 @pytest.mark.parametrize(
     ("name", "offset_sd"), [("LFM", None), ("LFM", OFFSETS), ("NFLFM", OFFSETS)]
 )
@@ -89,8 +89,8 @@ OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
         *(pytest.param(*x, marks=pytest.mark.slow) for x in ((1, 20), (2, 1), (1, 12))),
     ],
 )
-def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, offset_sd):
-    """Also where samples are passed over: 3 and 12 leave steps after the last that counts."""
+def test_gradient_and_hessian_equal_finite_differences(name, substeps, stride, offset_sd):
+    """Also with decimation: 3 and 12 leave steps after the last sample that counts."""
     p = problem(bent(name), substeps, stride, offset_sd=offset_sd)
     x = point(p)
     found = p.linearise(x)
@@ -117,8 +117,8 @@ def test_gradient_and_hessian_against_finite_differences(name, substeps, stride,
     )
 
 
-def test_a_stride_counts_each_sample_for_those_that_it_passes_over():
-    """What counts is every third sample, with the square root of three; all of them where one."""
+def test_decimated_samples_are_weighted_for_the_skipped_ones():
+    """Every third sample counts, with the square root of three, or all of them with one."""
     every, third = problem(bent("LFM")), problem(bent("LFM"), stride=3)
     x = point(every)
     torch.testing.assert_close(residuals(every, x), every.errors(x) / every.noise_sd)
@@ -129,7 +129,7 @@ def test_a_stride_counts_each_sample_for_those_that_it_passes_over():
 
 
 @pytest.mark.parametrize("piece", [1, 7])
-def test_pieces_do_not_show(piece, monkeypatch):
+def test_result_does_not_depend_on_the_chunks(piece, monkeypatch):
     """However many samples are accumulated at a time, the model of the cost is the same."""
     p = problem(bent("NFLFM"), stride=3)
     whole = p.linearise(point(p))
@@ -140,7 +140,7 @@ def test_pieces_do_not_show(piece, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
-def test_the_states_alone_have_the_same_derivatives(name):
+def test_state_derivatives_alone_are_the_same(name):
     p = problem(bent(name), stride=3, offset_sd=OFFSETS)
     x, count = point(p), p.variables.shared_count
     whole, alone = p.linearise(x), p.linearise(x, states=True)
@@ -149,7 +149,7 @@ def test_the_states_alone_have_the_same_derivatives(name):
     torch.testing.assert_close(alone.hessian, whole.hessian[count:, count:], rtol=1e-11, atol=1e-9)
 
 
-def test_padding_counts_for_nothing():
+def test_padding_has_no_effect():
     p = problem(bent("LFM"))
     x = point(p)
     before = p.linearise(x)
@@ -159,7 +159,7 @@ def test_padding_counts_for_nothing():
     assert float(before.cost) == float(after.cost)
 
 
-def test_residuals_are_counted_in_the_recording_s_coordinates():
+def test_residuals_are_in_the_coordinates_of_the_recording():
     p = problem(bent("LFM"))
     x = p.variables.start()
     joint = replace(p, measurement=torch.eye(2, dtype=F64))
@@ -168,8 +168,8 @@ def test_residuals_are_counted_in_the_recording_s_coordinates():
     torch.testing.assert_close(r[..., 1], own[..., 0] + own[..., 1])
 
 
-def test_an_exact_problem_is_solved_exactly():
-    """Positions without noise: the coefficients come out, and the model stays as it is."""
+def test_noise_free_problem_is_solved_exactly():
+    """With noise-free positions the true coefficients result, and the given model is unchanged."""
     model = LFM(2, [2e-3, 2e-3], v_smooth=0.1)
     before, plant = model.schedule.values, pendulum()
     w = windows(steps=60, step=5e-3)
@@ -182,7 +182,7 @@ def test_an_exact_problem_is_solved_exactly():
     assert torch.equal(model.schedule.values, before)
 
 
-def test_the_prior_of_the_plant_may_be_centred_elsewhere():
+def test_prior_mean_of_the_plant_may_be_set():
     p = problem(bent("LFM"))
     mean = torch.full((len(p.variables.terms),), 0.03, dtype=F64)
     sd = torch.tensor([t.prior_sd for t in p.variables.terms], dtype=F64)
@@ -192,7 +192,7 @@ def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
 
 
-def test_a_start_at_rest_is_held_and_the_others_are_free():
+def test_initial_states_at_rest_are_fixed_and_others_free():
     p = problem(bent("LFM"))
     free, mean = p.variables.prior()
     p = replace(p, windows=replace(p.windows, at_rest=(1,)))
@@ -205,7 +205,7 @@ def test_a_start_at_rest_is_held_and_the_others_are_free():
     assert torch.equal(same, mean)
 
 
-def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
+def test_simulated_motions_replace_smoothed_ones_inside_windows():
     """Longer windows start from it; samples outside every window keep the smoother's state."""
     w = windows()
     w = replace(w, spans=((0, 0, 20), (0, 20, 36)))
@@ -225,7 +225,7 @@ def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
 
 
 @pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
-def test_states_are_told_to_be_blocks_only_where_they_are(offset_sd):
+def test_states_are_declared_blocks_only_if_independent(offset_sd):
     p = problem(bent("LFM"), offset_sd=offset_sd)
     found = p.linearise(point(p))
     first, count = p.variables.shared_count, 2 * p.windows.q0.shape[-1]
@@ -236,7 +236,7 @@ def test_states_are_told_to_be_blocks_only_where_they_are(offset_sd):
 
 
 @pytest.mark.filterwarnings("error")
-def test_derivatives_that_overflow_are_told_to_the_search_alone():
+def test_overflow_of_derivatives_is_passed_to_the_search():
     maps = [torch.full((4, 1, 3, n), 1e200, dtype=F64) for n in (3, 1)]
     _, after = _carry(*maps, torch.ones(1, 3, 2, dtype=F64), 2)
     assert not torch.isfinite(after).any()

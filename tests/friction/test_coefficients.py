@@ -1,4 +1,4 @@
-"""Constant coefficients: positive, refused when wrong, told to fits as they are."""
+"""Constant coefficients: positive, validated, passed to fits unchanged."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def random_values(law: Law, joints: int, seed: int = 0) -> torch.Tensor:
 
 @every_law
 @given(raw=st.floats(-1e300, 1e300))
-def test_coefficients_are_positive_whatever_the_parameters(law: Law, raw: float) -> None:
+def test_coefficients_are_positive_for_any_parameters(law: Law, raw: float) -> None:
     schedule = Constant(law, 2)
     torch.nn.init.constant_(schedule.raw, raw)
     values = schedule(*motion(2)[:2])
@@ -28,17 +28,17 @@ def test_coefficients_are_positive_whatever_the_parameters(law: Law, raw: float)
 
 
 @every_law
-def test_given_coefficients_are_taken(law: Law) -> None:
+def test_given_coefficients_are_used(law: Law) -> None:
     values = random_values(law, 3)
     schedule = Constant(law, 3, values)
-    # The logarithm and back costs a few last digits.
+    # The logarithm and its inverse cost a few last digits.
     torch.testing.assert_close(schedule.values, values, rtol=1e-14, atol=0)
     one_row = Constant(law, 3, values[0].tolist())
     torch.testing.assert_close(one_row.values, values[:1].expand(3, -1), rtol=1e-14, atol=0)
     assert schedule(*motion(3)[:2]).dtype == torch.float64
 
 
-def test_zero_is_as_good_as_zero() -> None:
+def test_zero_coefficient_is_practically_zero() -> None:
     schedule = Constant(LINEAR, 1, [0.0, 1.0])
     assert 0 < schedule.values[0, 0] <= 1.001 * SMALLEST
 
@@ -51,13 +51,13 @@ def test_zero_is_as_good_as_zero() -> None:
         ([float("inf"), 1.0], "`B` of joint 1 must be finite"),
         ([1.0], r"\(2, 2\).*\(B, C\), got shape \(1,\)"),
         (1.0, r"got shape \(\)"),
-        ([[1.0], [1.0]], r"got shape \(2, 1\)"),  # one column would silently serve for both
+        ([[1.0], [1.0]], r"got shape \(2, 1\)"),  # one column would silently be used for both
         ([[1.0, 1.0]] * 3, r"got shape \(3, 2\)"),
         ([[1.0, 1.0], [1.0]], "array of numbers"),
         (["a", "b"], "array of numbers"),
     ],
 )
-def test_wrong_coefficients_are_refused_and_named(values: object, message: str) -> None:
+def test_wrong_coefficients_are_refused_by_name(values: object, message: str) -> None:
     schedule = Constant(LINEAR, 2, [0.1, 0.2])
     before = schedule.parameter_vector()
     with pytest.raises(ValueError, match=message):
@@ -71,13 +71,13 @@ def test_signed_coefficients_may_be_negative_but_finite() -> None:
         Constant(NONLINEAR, 1, [float("nan"), 0, 0, 0, 1])
 
 
-def test_joints_are_at_least_one() -> None:
+def test_at_least_one_joint_is_required() -> None:
     with pytest.raises(ValueError, match="at least 1, got 0"):
         Constant(LINEAR, 0)
 
 
 @every_law
-def test_the_parameter_vector_is_the_coefficients_and_goes_round_unchanged(law: Law) -> None:
+def test_parameter_vector_round_trip_is_exact(law: Law) -> None:
     schedule = Constant(law, 100)
     raw = 5 * normal(100, len(law.names))  # for many of these log(exp(raw)) is not raw
     with torch.no_grad():
@@ -94,14 +94,14 @@ def test_the_parameter_vector_is_the_coefficients_and_goes_round_unchanged(law: 
 
 
 @every_law
-def test_bounds_keep_what_is_not_fitted_and_the_sign_of_the_rest(law: Law) -> None:
+def test_bounds_fix_unfitted_coefficients_and_the_sign_of_others(law: Law) -> None:
     schedule = Constant(law, 2, random_values(law, 2))
     lower, upper = (b.reshape(2, -1) for b in schedule.bounds())
     for k, c in enumerate(law.coefficients):
         if c.fitted and c.linear:
             assert (lower[:, k] == (SMALLEST if c.positive else -torch.inf)).all()
             assert (upper[:, k] == torch.inf).all()
-        elif c.fitted:  # free well beyond what is tried, but not without end
+        elif c.fitted:  # free far outside the initial grid, but bounded
             assert (lower[:, k] > 0).all()
             assert (lower[:, k] < min(c.initial_grid)).all()
             assert (upper[:, k] > max(c.initial_grid)).all()
@@ -111,20 +111,20 @@ def test_bounds_keep_what_is_not_fitted_and_the_sign_of_the_rest(law: Law) -> No
             assert torch.equal(upper[:, k], schedule.values[:, k])
 
 
-def test_nothing_is_known_beforehand() -> None:
+def test_there_is_no_prior_by_default() -> None:
     mean, sd = Constant(LINEAR, 2).prior()
     assert (mean == 0).all()
     assert torch.isinf(sd).all()
 
 
 @every_law
-def test_sensitivities_are_those_of_the_coefficients_themselves(law: Law) -> None:
+def test_sensitivities_are_those_of_the_coefficients(law: Law) -> None:
     schedule = Constant(law, 2, random_values(law, 2))
     qd, qdd, _ = motion(4, 2)
     found = schedule.sensitivities(qd, qdd)
     start = schedule.parameter_vector()
     for p in range(len(start)):
-        # Central differences of what is linear in the vector: exact up to rounding over the step.
+        # Central differences of a linear function: exact up to rounding over the step.
         step = 1e-4 * torch.eye(len(start), dtype=torch.float64)[p]
         schedule.set_parameter_vector(start + step)
         above = schedule.values
@@ -150,12 +150,12 @@ def test_dtype_follows_the_module() -> None:
     )
 
 
-def test_it_says_what_it_holds() -> None:
+def test_repr_shows_the_coefficients() -> None:
     assert "C_p=0.25" in repr(Constant(VISCOUS, 2, [0.25]))
 
 
 @every_law
-def test_parameter_names_say_where_a_parameter_acts(law: Law) -> None:
+def test_parameter_names_match_where_a_parameter_acts(law: Law) -> None:
     schedule = Constant(law, 2)
     names = schedule.parameter_names(["shoulder", "elbow"])
     schedule.set_parameter_vector(torch.arange(1.0, len(names) + 1, dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""A quadratic within bounds: the minimum, however it is found."""
+"""Minimum of a quadratic within bounds, by every solution path."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ F64 = torch.float64
 
 
 def problem(loose: int, tight: int, seed: int, rank: int | None = None):
-    """A quadratic of which some unknowns have bounds, in mixed order."""
+    """A quadratic with bounds on some unknowns, in mixed order."""
     g = torch.Generator().manual_seed(seed)
     size = loose + tight
     rows = torch.randn(rank or 2 * size, size, generator=g, dtype=F64)
@@ -35,7 +35,7 @@ def assert_minimum(x, system, slope, low, high) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_has_no_bounds_may_be_solved_for_apart(seed, monkeypatch):
+def test_unbounded_unknowns_may_be_eliminated(seed, monkeypatch):
     given = problem(60, 20, seed)
     whole = found(*given)
     assert_minimum(whole, *given)
@@ -45,7 +45,7 @@ def test_what_has_no_bounds_may_be_solved_for_apart(seed, monkeypatch):
 
 
 @pytest.mark.parametrize("rank", [3, 8])
-def test_a_singular_system_ends_at_a_minimum_and_soon(rank, monkeypatch):
+def test_singular_system_converges_quickly_to_a_minimum(rank, monkeypatch):
     asked = []
 
     def solve(matrix, right, _):
@@ -60,7 +60,7 @@ def test_a_singular_system_ends_at_a_minimum_and_soon(rank, monkeypatch):
         assert len(asked) < 25  # of at most 33 rounds
 
 
-def test_bounds_that_are_equal_hold_and_nothing_is_no_problem():
+def test_equal_bounds_fix_a_value_and_empty_problems_are_solved():
     system, slope, low, high = problem(4, 4, 0)
     fixed = low.isfinite()
     low[fixed] = high[fixed] = 0.0

@@ -1,4 +1,4 @@
-"""Searches of the position error find what made the recording, stop and go on."""
+"""Direct searches of the position error recover the true friction, stop and resume."""
 
 import json
 from dataclasses import asdict
@@ -27,7 +27,7 @@ TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 
 @pytest.fixture(scope="module")
 def recorded():
-    # An encoder so fine that the start of every window is known: a search does not seek it.
+    # An encoder so fine that the initial state of every window is known and not searched.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tests.fitting.recordings.COUNTS", 2**22)
         recording = swing(pendulum(), LFM(2, TRUTH, v_smooth=V_SMOOTH), seconds=3.0)
@@ -61,7 +61,7 @@ def test_a_free_run_is_one_window(recorded):
     assert found.status.startswith(("Converged", "Not converged"))
 
 
-def test_a_resumed_search_is_the_uninterrupted_one(recorded):
+def test_resumed_search_equals_the_uninterrupted_one(recorded):
     whole = fitted(recorded, LFM(2, v_smooth=V_SMOOTH), max_evaluations=150, seed=3)
     kept = []
 
@@ -77,7 +77,7 @@ def test_a_resumed_search_is_the_uninterrupted_one(recorded):
 
 
 def test_candidates_of_a_batch_equal_single_simulations(recorded):
-    """Each candidate, in each window, is what `integrate` gives for its coefficients."""
+    """Each candidate, in each window, equals `integrate` with its coefficients."""
     recording, motions = recorded
     model, plant = LFM(2, v_smooth=V_SMOOTH), pendulum()
     cut = cut_windows([recording], motions, 1.0)
@@ -102,9 +102,9 @@ def box(**changes):
 
 
 @pytest.mark.parametrize("method", ["pattern", "sqp"])
-def test_minima_on_bounds_fixed_and_logarithmic_variables(method):
+def test_bounds_fixed_and_logarithmic_variables_are_handled(method):
     def cost(x):
-        # NaN where the first is large, as a simulation that diverges.
+        # NaN if the first is large, like a simulation that diverges.
         value = (x[:, 0] + 1).square() + (x[:, 1] / 0.02).log().square() + x[:, 2]
         return torch.where(x[:, 0] > 3, torch.nan, value)
 
@@ -116,7 +116,7 @@ def test_minima_on_bounds_fixed_and_logarithmic_variables(method):
     assert result.value == pytest.approx(float(cost(result.vector[None])))
 
 
-def test_what_a_search_cannot_do_is_refused(recorded):
+def test_unsupported_searches_are_refused(recorded):
     with pytest.raises(ValueError, match="constant or adaptive"):
         fitted(recorded, NFLFM(2))
     with pytest.raises(ValueError, match="method"):

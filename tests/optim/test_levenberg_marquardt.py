@@ -1,4 +1,4 @@
-"""Laws of the Levenberg-Marquardt solver."""
+"""Properties of the Levenberg-Marquardt solver."""
 
 import math
 from collections.abc import Callable
@@ -53,7 +53,7 @@ def line(n: int = 40, noise: float = 0.1) -> tuple[Tensor, Tensor]:
     return torch.stack([torch.ones_like(t), t], 1), y
 
 
-def test_nothing_to_fit_is_fitted_at_once() -> None:
+def test_empty_problem_converges_at_once() -> None:
     solver = LevenbergMarquardt()
     result = solver.minimise(lambda x: Quadratic(2.0, x, x[:, None] * x), vector())
     assert result.converged
@@ -72,7 +72,7 @@ def test_rosenbrock_reaches_its_minimum_from_anywhere(start: tuple) -> None:
     assert result.steps == len(costs) <= result.evaluations
 
 
-def test_powell_singular_converges_although_its_hessian_is_singular_there() -> None:
+def test_powell_singular_converges_despite_its_singular_hessian() -> None:
     result = LevenbergMarquardt().minimise(FromResiduals(powell_singular), vector(3, -1, 0, 1))
     assert result.converged
     assert result.x.abs().max() < 1e-6  # the cost is of fourth order in x
@@ -112,7 +112,7 @@ def test_active_bound_gives_the_constrained_minimum() -> None:
     )
     assert result.converged
     assert result.at_upper.tolist() == [False, True]
-    # With the slope held at 1.5 the intercept is the mean of what is left.
+    # With the slope fixed at 1.5 the intercept is the mean of the remainder.
     assert float(result.x[0]) == pytest.approx(float((y - 1.5 * X[:, 1]).mean()), rel=1e-10)
     assert result.gradient[1] < 0  # Kuhn-Tucker: the gradient pushes outward
 
@@ -132,23 +132,23 @@ def test_strongly_coupled_bounds_satisfy_kuhn_tucker() -> None:
         assert result.converged
         assert ((result.x >= -0.1) & (result.x <= 0.2)).all()
         slope, free = result.gradient, ~(result.at_lower | result.at_upper)
-        # A slope s along one parameter promises a fall of s^2 / (2 H); below the tolerance of the
-        # cost a search may end.
+        # A slope s along one parameter predicts a decrease of s^2 / (2 H); a search may end if that
+        # is below the cost tolerance.
         least = (2e-14 * result.cost * result.hessian.diagonal()).sqrt()
         assert (slope.abs() < least)[free].all()
         assert (slope > -least)[result.at_lower].all()
         assert (slope < least)[result.at_upper].all()
 
 
-def test_on_coupled_bounds_no_search_ends_short_of_the_minimum() -> None:
-    """From corners of the box, against an exact solver of bounded linear least squares."""
+def test_search_on_coupled_bounds_reaches_the_minimum() -> None:
+    """From corners of the box, compared with an exact solver of bounded linear least squares."""
     generator = torch.Generator().manual_seed(5)
     for _ in range(100):
         weak, common, loads = (
             torch.randn(*shape, generator=generator, dtype=F64)
             for shape in ((12, 6), (12, 2), (2, 6))
         )
-        # Six columns that differ by little from two directions make up for one another.
+        # Six columns that differ little from two directions are nearly collinear.
         J = common @ loads + 10 ** -float(3 * torch.rand(1, generator=generator)) * weak
         y = torch.randn(12, generator=generator, dtype=F64)
         start = 0.05 + 0.15 * torch.randint(-1, 2, (6,), generator=generator).double()
@@ -157,13 +157,14 @@ def test_on_coupled_bounds_no_search_ends_short_of_the_minimum() -> None:
         )
         exact = lsq_linear(J.numpy(), y.numpy(), (-0.1, 0.2), method="bvls", tol=1e-14)
         assert result.converged
-        # Where it is lower, the exact solver has run out of its iterations.
+        # If ours is lower, the exact solver has reached its iteration limit.
         assert result.cost <= exact.cost * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("lower", [-0.1, 0.0, 1e-12])
-def test_a_parameter_a_rounding_off_its_bound_is_on_it(lower: float) -> None:
-    """No step in other units ends exactly on a bound, but the verdict must name it."""
+def test_parameter_within_round_off_of_its_bound_is_active(lower: float) -> None:
+    """A step in scaled units never ends exactly on a bound, but the result must report it as
+    active."""
     generator = torch.Generator().manual_seed(2)
     pinned = 0
     for _ in range(70):
@@ -191,7 +192,7 @@ def test_start_on_a_bound_leaves_it_when_the_minimum_is_inside() -> None:
     assert not (result.at_lower | result.at_upper).any()
 
 
-def test_rank_deficiency_is_survived() -> None:
+def test_rank_deficient_problem_is_solved() -> None:
     X, y = line()
     model = FromResiduals(lambda w: X[:, 0] * w[0] + X[:, 1] * (w[1] + 2 * w[2]) - y)
     result = LevenbergMarquardt().minimise(model, torch.zeros(4, dtype=F64))
@@ -203,7 +204,7 @@ def test_rank_deficiency_is_survived() -> None:
 
 
 def test_not_a_number_is_a_rejected_step() -> None:
-    # sqrt is NaN left of zero, where the first full step leads.
+    # sqrt is NaN for negative values, which the first full step reaches.
     def residual(x: Tensor) -> Tensor:
         return torch.stack([x[0].sqrt() - 0.1])
 
@@ -215,7 +216,7 @@ def test_not_a_number_is_a_rejected_step() -> None:
         assert float(result.x[0]) == pytest.approx(0.01, rel=1e-9)
 
 
-def test_nothing_finite_is_said_plainly() -> None:
+def test_problem_without_finite_values_reports_not_finite() -> None:
     at_start = LevenbergMarquardt().minimise(FromResiduals(lambda x: x.log()), vector(-1.0))
     assert (at_start.status, at_start.converged) == ("not_finite", False)
 
@@ -227,7 +228,7 @@ def test_nothing_finite_is_said_plainly() -> None:
     assert (around.status, float(around.x[0])) == ("not_finite", 1.0)
 
 
-def test_wrong_derivative_is_a_stall_not_a_success() -> None:
+def test_wrong_derivative_is_reported_as_a_stall() -> None:
     model = FromResiduals(rosenbrock, lambda x: -torch.func.jacfwd(rosenbrock)(x))
     result = LevenbergMarquardt().minimise(model, vector(-1.2, 1.0))
     assert (result.status, result.converged) == ("stalled", False)
@@ -235,7 +236,7 @@ def test_wrong_derivative_is_a_stall_not_a_success() -> None:
 
 
 @pytest.mark.parametrize("powers", [(3, -4), (20, -30)])
-def test_units_of_the_parameters_do_not_matter(powers: tuple[int, int]) -> None:
+def test_result_is_invariant_to_parameter_units(powers: tuple[int, int]) -> None:
     # Powers of two scale without rounding, so the two runs agree bit for bit.
     scale = vector(*(2.0**power for power in powers))
     model, start = FromResiduals(rosenbrock), vector(-1.2, 1.0)
@@ -248,7 +249,7 @@ def test_units_of_the_parameters_do_not_matter(powers: tuple[int, int]) -> None:
     assert scaled.status == plain.status
 
 
-def test_given_jacobian_and_cheap_cost_change_nothing() -> None:
+def test_given_jacobian_and_cost_do_not_change_the_result() -> None:
     def jacobian(x: Tensor) -> Tensor:
         return torch.stack(
             [torch.stack([-20 * x[0], x.new_tensor(10.0)]), x.new_tensor([-1.0, 0.0])]
@@ -292,12 +293,12 @@ def test_callback_sees_every_step_and_can_stop() -> None:
     assert torch.equal(seen[-1][0], result.x)
 
 
-def test_step_limit_is_no_convergence() -> None:
+def test_step_limit_is_not_convergence() -> None:
     result = LevenbergMarquardt(max_steps=2).minimise(FromResiduals(rosenbrock), vector(-1.2, 1))
     assert (result.status, result.converged, result.steps) == ("max_steps", False, 2)
 
 
-def test_bad_input_is_refused_at_the_border() -> None:
+def test_bad_input_is_refused_on_entry() -> None:
     model, start = FromResiduals(rosenbrock), vector(0, 0)
     solver = LevenbergMarquardt()
     with pytest.raises(ValueError, match="vector"):
