@@ -75,10 +75,8 @@ class FrictionModel(nn.Module):
         for name, given in (("qd", qd), ("qdd", qdd), ("load", load)):
             width = given.shape[-1] if given.ndim else 0
             if width != self.joints:
-                raise ValueError(
-                    f"`{name}` must be (*batch, joint) with {self.joints} joints, got last axis "
-                    f"{width}."
-                )
+                shape = f"(*batch, joint) with {self.joints} joints, got last axis {width}"
+                raise ValueError(f"`{name}` must be {shape}.")
         return self.torque(qd, load, self.schedule(qd, qdd))
 
     # A simulation computes the torque in two steps: the coefficients at a sample, which it holds,

@@ -197,7 +197,7 @@ def test_number_of_joints_must_match() -> None:
     with pytest.raises(ValueError, match="3 joints, got last axis 2"):
         LFM(3)(*motion(5, 2))
     qd, qdd, load = motion(1, 3)
-    with pytest.raises(ValueError, match="`load` must be .* 3 joints, got last axis 1"):
+    with pytest.raises(ValueError, match=r"`load` must be .* 3 joints, got last axis 1"):
         LFM(3)(qd, qdd, load.reshape(3, 1))
     assert LFM(np.int64(3)).schedule.joints == 3
 
