@@ -491,7 +491,7 @@ def _mistakes(
         unlike = dict(unlike_training(fit.plant, fit.model, trained, tested))
     for recording, (joint, moved) in zip(test.recordings, tested, strict=True):
         stated, mistakes = likely_mistakes(
-            plant, [joint], [moved], recording.resolve_convention(plant)
+            fit.plant, [joint], [moved], recording.resolve_convention(plant)
         )
         said, change = mistake_warning(stated, mistakes), unlike.get(joint.name)
         # A changed torque may look like a wrong rig, which the training recordings contradict.

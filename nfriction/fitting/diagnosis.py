@@ -44,6 +44,8 @@ ALIKE = 0.1
 LOG_RATIOS = math.log(1.5), math.log(300.0)
 # Cogging repeats with the least common multiple of slots and poles, at most about this.
 MOST_PER_TURN = 300
+# Linear solutions for terms that multiply each other; their error is squared each time.
+SOLUTIONS = 5
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -58,6 +60,7 @@ class Mistake:
 
     text: str  # a clause such as "the sign of joint2's position is reversed"
     unexplained: float  # share of the torque after the correction [-]; NaN if none is known
+    rig: Plant | None = None  # corrected in several terms at once
 
 
 @dataclass(frozen=True)
@@ -173,14 +176,16 @@ def likely_mistakes(
         unlike = [] if zeroed else unlike
     # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
+    several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
-    rare.append(_wrong_rate(plant, given))
+    rare += [_wrong_rate(plant, given), *(each[:2] for each in several)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
     explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
-    found = [Mistake(text, share) for text, share in (*unlike, *explain)]
+    rigs = {text: rig for text, _, rig in several}
+    found = [Mistake(text, share, rigs.get(text)) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
@@ -199,6 +204,15 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     )
     known = not math.isnan(mistakes[0].unexplained)
     return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
+
+
+def correction_note(stated: float, mistake: Mistake) -> str:
+    """A mistake in the rig that a fit corrects, in a sentence."""
+    return (
+        f"{mistake.text[0].upper()}{mistake.text[1:]}. Friction leaves {stated:.2g} of the torque "
+        f"unexplained, after the correction {mistake.unexplained:.2g}. The fit starts from the "
+        "corrected rig, see `FitResult.plant`."
+    )
 
 
 def unlike_training(
@@ -690,6 +704,37 @@ def _scaled_terms(
                 yield term, x, adjusted_plant(plant, [term], given.q.new_tensor([x]))
 
 
+def _several_terms(
+    plant: Plant, given: _Data, options: FitOptions
+) -> Iterator[tuple[str, float, Plant]]:
+    """Inertia, gravity and length terms that together explain most, unless a fit reaches them.
+
+    Masses and their centres are often guessed for a rig of one's own, all of them wrongly.
+    """
+    terms = [
+        term
+        for term in plant_parameters(plant, driven=given.driven, options=options)
+        if term.ratio and term.name.startswith(("inertia", "gravity", "length", "mass"))
+    ]
+    one, x = given.q.new_ones(1), given.q.new_zeros(len(terms))
+    for _ in range(SOLUTIONS if len(terms) > 1 else 0):
+        rig = adjusted_plant(plant, terms, x)
+        needed = given.needed(rig)
+        slopes = [needed - given.needed(adjusted_plant(rig, [term], one)) for term in terms]
+        _, change = _balance(given, given.tau - needed, torch.stack(slopes, -1))
+        x = (1.0 + x) * (1.0 + change) - 1.0
+        if not (x > -1.0).all():
+            return
+    pairs = [*zip(terms, x.tolist(), strict=True)]
+    if any(not term.lower <= value <= term.upper for term, value in pairs):
+        times = ", ".join(f"{term.name} {1 + value:.3g}" for term, value in pairs)
+        rig = adjusted_plant(plant, terms, x)
+        # A motion without torque determines only ratios.
+        scale = "" if given.driven else ", for gravity 1 as given"
+        text = f"several terms of the rig are wrong (times the given ones{scale}: {times})"
+        yield text, _unexplained(rig, given), rig
+
+
 def _corrected_torques(
     plant: Plant, given: _Data, options: FitOptions
 ) -> Iterator[tuple[str, _Data]]:
@@ -703,7 +748,7 @@ def _corrected_torques(
         part[:, joints] = given.tau[:, joints]
         # The gain is estimated together with the friction, which would bias a ratio of torques.
         without = replace(given, tau=given.tau - part)
-        gain = _balance(without, without.tau - given.needed(plant), part)[1]
+        gain = float(_balance(without, without.tau - given.needed(plant), part)[1])
         if gain and abs(gain - 1) > options.gain_term[0]:
             size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
             # Three digits, but 1000 and not 1e+03.
@@ -830,7 +875,7 @@ def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, flo
     curvature = curvature.repeat_interleave(given.block, 0)
     for j in given.driven:
         part = torch.where(torch.arange(plant.joints) == j, curvature, 0.0)
-        ratio = -_balance(given, given.tau - needed, part)[1]
+        ratio = -float(_balance(given, given.tau - needed, part)[1])
         if ratio > 0:
             text = (
                 f"{plant.joint_names[j]} is elastic or has play between drive and encoder "
@@ -1051,7 +1096,7 @@ def _springs(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     needed = given.needed(plant)
     for j in given.driven:
         part = torch.where(torch.arange(plant.joints) == j, given.q, 0.0)
-        stiffness = -_balance(given, given.tau - needed, part)[1]
+        stiffness = -float(_balance(given, given.tau - needed, part)[1])
         kind, unit = ("force", "N/m") if plant.unit == "m" else ("torque", "N m/rad")
         text = (
             f"{plant.joint_names[j]} has a spring of {stiffness:.3g} {unit} that the rig lacks "
@@ -1194,7 +1239,7 @@ def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
     own = dict(plant.named_buffers())
     moved = plant.replace(**{name: own[name] + part for name, part in change.items()})
     needed = given.needed(plant)
-    return _balance(given, given.tau - needed, needed - given.needed(moved))[1]
+    return float(_balance(given, given.tau - needed, needed - given.needed(moved))[1])
 
 
 def _unexplained(plant: Plant, data: _Data, extra: Tensor | None = None) -> float:
@@ -1230,8 +1275,8 @@ def _share(plant: Plant, data: _Data, target: Tensor) -> float:
     return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
 
 
-def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, float]:
-    """Mean square of unexplained torque, (joint,), and the factor of the first `extra` torque."""
+def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Mean square of unexplained torque, (joint,), and factors of `extra` torques, (column,)."""
     from scipy.optimize import nnls  # slow to import
 
     left, terms, weight = _equations(data, torque, extra)
@@ -1244,13 +1289,14 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
     norm[norm == 0] = 1.0
     rows = np.column_stack([scaled / norm, left.flatten().numpy()])
     if not np.isfinite(rows).all():
-        return torch.full_like(weight, math.inf), math.nan
+        return torch.full_like(weight, math.inf), torch.full((1,), math.nan)
     # The triangular factor has the same normal equations.
     _, factor = np.linalg.qr(rows)
     found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
     residual = weight * (left - design @ torch.as_tensor(found))
-    factor_of_extra = 0.0 if extra is None else found[0] - found[-free.shape[-1]]
-    return residual.square().mean(0), float(factor_of_extra)
+    count = 0 if extra is None else extra.numel() // data.q.numel()
+    factors = found[:count] - found[terms.shape[-1] :][:count]
+    return residual.square().mean(0), torch.as_tensor(factors)
 
 
 def _equations(

@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -106,11 +107,18 @@ def prepare_task(
         delay, _ = diagnosis.balanced_delay(plant, joint, moved, options)
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
-    stated, mistakes = diagnosis.likely_mistakes(
-        plant, advanced, moved, convention, options, zeroed=per_recording,
-        presliding=bool(model.law.memory),
+    diagnosed = partial(
+        diagnosis.likely_mistakes, recordings=advanced, motions=moved, convention=convention,
+        options=options, zeroed=per_recording, presliding=bool(model.law.memory),
     )  # fmt: skip
-    named = diagnosis.mistake_warning(stated, mistakes)
+    stated, mistakes = diagnosed(plant)
+    corrected: tuple[str, ...] = ()
+    # Without torques only the ratios of its terms matter, and no drive can be the cause.
+    if options.fit_plant and not inputs.largest_torques(joint).any() and mistakes:
+        for rig in (m.rig for m in mistakes[:1] if m.rig is not None):
+            corrected, plant = (diagnosis.correction_note(stated, mistakes[0]),), rig
+            stated, mistakes = diagnosed(plant)
+    named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
         # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
@@ -132,7 +140,7 @@ def prepare_task(
     measurement = inputs.measurement_matrix(plant, convention)
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
-        found, tuple(m.text for m in mistakes), tuple(drift), tuple(unmodelled),
+        found, tuple(m.text for m in mistakes), tuple(drift), (*corrected, *unmodelled),
         (inputs.SMOOTHED.format(floor, wanted),) * blurred,
     )  # fmt: skip
 

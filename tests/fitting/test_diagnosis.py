@@ -518,6 +518,37 @@ def test_mistakes_in_rigs_are_named(name, rig, finding):
     assert finding in warnings_of(plant, q, tau)[0]
 
 
+GUESSED = {"mass": [0.2, 0.2], "length": [0.2, 0.25]}
+
+
+def test_free_rig_with_guessed_masses_and_lengths_is_corrected():
+    true, q, _ = measured("free")
+    guessed = PendulumChain(**GUESSED)
+    recording = Recording(STEP * np.arange(SAMPLES), q, convention="relative,upright")
+    found = fit("coulomb-viscous", guessed, recording)
+    rating, reason = found.usability
+    assert rating == "doubtful"
+    assert reason.startswith("several terms of the rig are wrong, see warnings")
+    (note,) = found.unmodelled
+    assert re.search(
+        r"as given: .*gravity 2 0\.52\d, length 1 1\.5.*The fit starts from the corrected rig", note
+    )
+    # A free swing determines ratios to the first gravity term.
+    scale = guessed.gravity_moment[0] / true.gravity_moment[0]
+    for name in ("gravity_moment", "inertia_coupling"):
+        values, expected = getattr(found.plant, name), scale * getattr(true, name)
+        torch.testing.assert_close(values, expected, rtol=0.03, atol=0.0)
+    values = found.model.schedule.values / scale
+    expected = torch.tensor([[0.02, 0.004], [0.008, 0.003]], dtype=torch.float64)
+    torch.testing.assert_close(values, expected, rtol=0.1, atol=0.0)
+
+
+def test_driven_rig_with_several_wrong_terms_is_named():
+    _, q, tau = measured("driven")
+    (warned, *_) = warnings_of(PendulumChain(**GUESSED), q, tau)
+    assert "several terms of the rig are wrong (times the given ones: inertia 11 " in warned
+
+
 @pytest.mark.parametrize(("name", "remedy"), [("driven", "`gravity`: 1e-6"), ("arm", "no `mass`")])
 def test_torques_without_gravity_are_named(name, remedy):
     """The rig lies flat, or its controller adds gravity after the torque is recorded."""
