@@ -10,9 +10,9 @@ coefficients themselves for parameters. The next step is `nfriction.friction.mod
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from numbers import Integral
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -58,7 +58,7 @@ class Schedule(nn.Module, ABC):
         super().__init__()
         if not isinstance(law, Law):
             raise TypeError(f"`law` must be a Law, such as laws.VISCOUS, got {law!r}.")
-        if not isinstance(joints, Integral) or joints < 1:
+        if not isinstance(joints, int | np.integer) or joints < 1:
             raise ValueError(f"`joints` must be a whole number of at least 1, got {joints!r}.")
         self.joints = int(joints)
         self.coefficient_names = list(law.names)

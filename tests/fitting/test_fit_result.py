@@ -10,10 +10,10 @@ from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.models import LFM, NCFM, Stribeck
+from nfriction.friction.models import CVFM, LFM, NCFM, Stribeck
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.papers.afem.adaptive import ALFM
-from tests.fitting.recordings import driven_axis
+from tests.fitting.recordings import driven_axis, pendulum, swing
 
 AXIS = LinearAxis(2.0)
 
@@ -41,6 +41,14 @@ def test_table_marks_active_bounds_and_unidentifiable_values(found: FitResult) -
     assert list(replace(found, at_bounds=(b,)).to_pandas()["note"]) == ["at a bound", ""]
     unknown = replace(found, at_bounds=(b,), unidentifiable=(f"{b} with {c}",))
     assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
+
+
+def test_too_few_integration_steps_are_reported_once() -> None:
+    rig, truth = pendulum(), CVFM(2, [[5e-3, 1e-3], [2e-3, 5e-4]], v_smooth=0.05)
+    recording = swing(rig, truth.requires_grad_(False), seconds=2.0)
+    result = fit(CVFM(2, v_smooth=1e-5), rig, recording, windows=(0.5,), max_steps=1)
+    (warning,) = (text for text in result.warnings if text.startswith("Near rest a sample needs"))
+    assert "fits take 8" in warning
 
 
 def test_table_marks_fixed_coefficients(found: FitResult) -> None:

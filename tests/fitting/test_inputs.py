@@ -146,9 +146,11 @@ def test_dry_and_viscous_friction_have_separate_direction_ratios() -> None:
     assert not chosen_inputs(strict, law)[0]
 
 
-def test_heat_dependence_is_recovered() -> None:
-    """Although it cools faster than a long window lasts."""
+@pytest.mark.parametrize("cooling_time", [COOLING, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_heat_dependence_is_recovered(cooling_time) -> None:
+    """Although it cools faster than a long window lasts, or more slowly than a recording."""
     brief, true = {**BRIEF, "windows": (0.5, 3.0)}, truth("heat")
+    true.schedule.set_heat(CAPACITY, cooling_time, 2e-3)
     recording = swing(pendulum(), true, seconds=6.0)
     law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **brief)
     model = NFCVFM(2, v_smooth=V_SMOOTH)
@@ -163,7 +165,10 @@ def test_heat_dependence_is_recovered() -> None:
     )
     assert expected.amax() > 0.6
     torch.testing.assert_close(fall, expected, rtol=0, atol=0.05)
-    assert found.model.schedule.cooling_time == pytest.approx(COOLING, rel=0.5)
+    if cooling_time == COOLING:
+        assert found.model.schedule.cooling_time == pytest.approx(COOLING, rel=0.5)
+    else:  # 6 s hardly determine it
+        assert found.model.schedule.cooling_time > 12.0
     assert found.residual < 0.1 * law.residual
 
 

@@ -3,7 +3,6 @@
 Warnings report signs that recordings violate the assumptions of the plant and the fit.
 """
 
-import logging
 import math
 import textwrap
 import warnings
@@ -36,7 +35,6 @@ from nfriction.recording.validation import MINIMUM_SAMPLES, gaps
 from nfriction.signals import Motion, count_seen, kalman_smoother
 from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
-logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 # Width of the smoothed sign of a model made by name, as a share of the slowest joint's largest
@@ -377,16 +375,18 @@ def integration_substeps(
     plant: Plant, model: FrictionModel, longest_step: float, options: FitOptions = DEFAULTS
 ) -> int:
     """Integration steps per sample of at most `longest_step` [s]."""
-    needed, most = required_substeps(plant, model, longest_step), options.max_substeps
-    if needed > most:
-        logger.warning(
-            "near rest a sample needs %d integration steps, fits take %d, so motion near rest is "
-            "approximate; a higher sample rate avoids this, or a model with v_smooth >= %.2g "
-            "(now %.2g)",
-            needed, most, model.v_smooth * needed / most, model.v_smooth,
-        )  # fmt: skip
+    needed = required_substeps(plant, model, longest_step)
     # Twice the present need, because coefficients may grow during the search.
-    return min(1 if needed == 1 else 2 * needed, most)
+    return min(1 if needed == 1 else 2 * needed, options.max_substeps)
+
+
+def too_few_steps(
+    plant: Plant, model: FrictionModel, longest_step: float, options: FitOptions = DEFAULTS
+) -> tuple[str, ...]:
+    """A warning if a sample near rest needs more integration steps than a fit takes."""
+    needed, most = required_substeps(plant, model, longest_step), options.max_substeps
+    wider = model.v_smooth * needed / most
+    return (COARSE.format(needed, most, wider, model.v_smooth),) * (needed > most)
 
 
 ZEROED_PER_RECORDING = (
@@ -398,6 +398,10 @@ SMOOTHED = (
     "Dry friction is smoothed over velocities of ±{:.2g} instead of ±{:.2g}, because a steeper "
     "sign needs more integration steps than a fit takes; this may cause errors above the noise. A "
     "model with a smaller `v_smooth`, or recordings with a higher sample rate, avoid them."
+)
+COARSE = (
+    "Near rest a sample needs {} integration steps, fits take {}, so motion there is approximate; "
+    "a higher sample rate avoids this, or a model with v_smooth >= {:.2g} (now {:.2g})."
 )
 # Density of steel [kg/m^3].
 STEEL = 7_850.0

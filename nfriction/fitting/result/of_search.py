@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import ranges
+from nfriction.fitting.data.inputs import ranges, too_few_steps
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.result import identifiability
 from nfriction.fitting.result.fit_result import FitResult
@@ -172,6 +172,10 @@ def result_from_shooting(
         + scaled
         + tuple(text for text, _ in gains)
         + (PROPORTIONAL,) * (not problem.windows.tau.any())
+        + too_few_steps(
+            problem.plant_at(vector), model,
+            max(r.longest_step for r in problem.windows.recordings), problem.options,
+        )
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))
         + outlier_warning(outliers),

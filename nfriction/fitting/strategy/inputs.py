@@ -39,6 +39,8 @@ from nfriction.plant import PendulumChain, Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.signals import Motion
 
+# Cooling times, in durations of a recording, above which it shows no cooling: 3 % of the heat.
+SLOW_COOLING = 30.0
 # Waves of friction over the position, per turn or per stroke of an axis.
 WAVES = (1, 2, 3, 4)
 # Alternatives among which an input is chosen for each joint: waves, and a quarter of a turn for the
@@ -210,7 +212,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
 
     Windows grow to those of the law, where it may be far from the law with inputs. The cooling time
     of heat minimises the residual over the shortest windows, between their length (within which a
-    network responds to the motion itself) and that of the longest recording.
+    network responds to the motion itself) and `SLOW_COOLING` times the longest recording.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
@@ -259,7 +261,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
 
     try:
         if "heat" in inputs and longest > shortest:
-            between = math.log(shortest), math.log(longest)
+            between = math.log(shortest), math.log(SLOW_COOLING * longest)
             found = minimize_scalar(
                 residual, bounds=between, method="bounded", options={"xatol": 0.2}
             )
