@@ -105,6 +105,10 @@ def mistakes() -> Iterator[Mistake]:
                   rig={"mass": [600, 400], "length": [300, 250], "com": [150, 120],
                        "inertia": [4.5e6, 2.1e6]})  # fmt: skip
     yield Mistake("spikes in a position", "jumps", spiked)
+    guessed = {"mass": [0.5, 0.5], "length": [0.2, 0.25], "com": None, "inertia": None}
+    for free in (False, True):
+        name = f"masses and lengths guessed, {'free' if free else 'driven'}"
+        yield Mistake(name, "several terms of the rig", rig=guessed, free=free)
     yield Mistake("time reversed", "backwards|gains energy", reversed_in_time, free=True)
     yield Mistake(
         "time in ms as s", "unit of its time|in ms", lambda r: r._replace(time=1e3 * r.time)
