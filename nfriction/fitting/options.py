@@ -144,7 +144,7 @@ class FitOptions:
     first_noise: float = 1e-3
     # Smaller errors are round-off [rad].
     min_noise: float = 1e-9
-    # Growth of the error from one horizon to the next at which a search has lost the motion.
+    # Growth of the error from one horizon to the next that does not yet indicate chaos.
     max_growth: float = 10.0
 
     # Chance that noise alone makes a stage appear worse at a shorter horizon.

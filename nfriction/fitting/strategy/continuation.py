@@ -12,7 +12,6 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.fit_result import UNIFORM_TURN
 from nfriction.fitting.result.identifiability import (
     NORMAL_95,
     covariance_root,
@@ -77,11 +76,9 @@ class HorizonResult:
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows show only that the motion is chaotic within them."""
-        if self.rms <= options.max_growth * before.rms:
-            return False
-        # On its circle, a joint that turns over is off by no more than this.
-        motion = self.problem.windows.q.var((0, 1)).clamp_max(UNIFORM_TURN**2).mean()
-        return not (self.result.converged and 2.0 * self.rms**2 <= float(motion))
+        longer = self.problem.windows.length / before.problem.windows.length
+        # A constant error of the torque causes one that grows with the square of time.
+        return not self.rms <= max(options.max_growth, longer**2) * before.rms
 
     def as_stopped(self) -> "HorizonResult":
         """The same stage, reported as stopped by the caller."""
