@@ -78,7 +78,8 @@ class NeuroFuzzy(Schedule):
             that of the sets by evidence.
 
     Attributes:
-        learn_sets: whether a fit moves the sets and the head's units in addition to their weights.
+        learn_sets: whether `parameter_vector` includes the sets and the head's units in addition to
+            their weights; a fit decides by evidence whether they move.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).

@@ -263,10 +263,11 @@ def initialise_from_constant(
 ) -> FrictionModel:
     """A copy of a neuro-fuzzy model set to a constant fit of its law, for the range of the motion.
 
-    Its network is zero; recordings and motions are in joint coordinates.
+    Its network's output is zero; recordings and motions are in joint coordinates.
     """
     network = copy.deepcopy(model)
     schedule = cast("NeuroFuzzy", network.schedule)
+    schedule.learn_sets = False  # only its weights become zero; sets move later, by evidence
     scale = coefficient_scale(model, constant.plant, recordings, motions)
     schedule.set_range(*input_range(motions, schedule.along_motion, options))
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
