@@ -71,7 +71,8 @@ def prepare_task(
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
     inputs.require_elementwise(model.law, model.joints)
-    if plant.has_position_load and not has_input(model.law, "position"):
+    given_position = has_input(model.law, "position") and not getattr(model, "selected", False)
+    if plant.has_position_load and not given_position:
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
     inputs.require_parts(given, 2 * options.edge)

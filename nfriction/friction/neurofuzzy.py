@@ -464,6 +464,10 @@ class NeuroFuzzyModel(NamedModel):
             `"direction"` of rotation, `"load"` of the bearing or `"position"`, `"heat"` of joints,
             each with its own coefficient (`with_inputs`); with None, a fit selects the useful ones.
         options: of the coefficients, e.g. `terms=(7, 5)`.
+
+    Attributes:
+        selected: whether a fit selected the inputs; the next one selects again. Inputs from a file
+            count as given.
     """
 
     def __init__(
@@ -483,11 +487,14 @@ class NeuroFuzzyModel(NamedModel):
         schedule = self.make_schedule(law, joints, initial, **options)
         FrictionModel.__init__(self, law, schedule, v_smooth)
         self.inputs = None if inputs is None else list(inputs)
+        self.selected = False
 
-    def see(self, inputs: Sequence[str]) -> None:
-        """Add further inputs, with initial coefficients."""
+    def see(self, inputs: Sequence[str] | None) -> None:
+        """Replace the further inputs, with an untrained network; a constant law keeps its own."""
+        own = self.schedule.coefficient_sets().get("always")
+        own = None if own is None else own[:, : len(self.definition.names)]
         options = {**self.options(), "inputs": inputs}
-        self.__init__(self.joints, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
+        self.__init__(self.joints, own, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
 
     def options(self) -> dict[str, Any]:
         return super().options() | ({} if self.inputs is None else {"inputs": self.inputs})

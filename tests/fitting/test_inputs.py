@@ -17,7 +17,9 @@ from nfriction import (
     Recording,
     Rotor,
     fit,
+    load,
     rollout,
+    save,
 )
 from nfriction.export import c, mjcf, onnx, torchscript
 from nfriction.fitting.options import FitOptions
@@ -268,6 +270,35 @@ def test_inputs_have_to_win_for_the_network_and_not_to_lose_for_its_law(
     assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
     assert found.task.model.inputs == ["direction"]
     assert task.model.inputs is None
+
+
+def test_inputs_that_a_fit_selected_are_selected_again(monkeypatch, tmp_path) -> None:
+    seen = []
+
+    def choose(plain):
+        seen.append(plain.task.model.law)
+        assert not plain.task.plant.has_position_load
+        if len(seen) == 2:
+            return (), plain
+        task = with_position_load(plain.task, plain.start)
+        task = replace(task, model=neurofuzzy._seeing(task.model, ["position"]))
+        start = widened_start(task, plain.start, ["position"])
+        return (InputGain("position", 0.5, (0.5, 0.1)),), neurofuzzy._Contest(task, start)
+
+    monkeypatch.setattr(neurofuzzy, "_with_chosen_inputs", choose)
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    recording, model = swing(pendulum(), truth("nothing"), seconds=1.0), NFCVFM(2)
+    settings = {"max_steps": 2, **BRIEF}
+    found = fit(model, pendulum(), recording, **settings)
+    assert model.inputs == found.model.inputs == ["position"]
+    assert found.plant.has_position_load
+    saved = load(save(model, tmp_path / "model.json"))
+    again = fit(model, found.plant, recording, **settings)
+    assert model.inputs is again.model.inputs is None
+    assert seen == [COULOMB_VISCOUS] * 2
+    # Those of a file count as given.
+    assert fit(saved, pendulum(), recording, **settings).model.inputs == ["position"]
+    assert len(seen) == 2
 
 
 @pytest.mark.slow

@@ -41,7 +41,6 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.task import FitTask, constant_prior, known_terms, regression, terms_after
-from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated
 from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
@@ -61,15 +60,13 @@ INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
+    model = task.model
+    if isinstance(model, NeuroFuzzyModel) and model.selected:
+        task = replace(task, model=_seeing(model, None))  # those of an earlier fit do not count
     given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
     task = replace(task, plant=inputs.seeing_plant(task.plant, given))
-    widens, own = bool({"heat", "position"} & {*given}), task
-    if widens:
-        law = cast("NeuroFuzzyModel", task.model).definition
-        values = task.model.schedule.coefficient_sets().get("always")
-        values = None if values is None else values[:, : len(law.names)]
-        cold = FrictionModel(law, Constant(law, task.model.joints, values), task.model.v_smooth)
-        own = replace(task, model=cold)
+    widens = bool({"heat", "position"} & {*given})
+    own = replace(task, model=_seeing(model, ())) if widens else task
     start = constant_start(own)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
@@ -84,17 +81,17 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         start = replace(start, model=fitter.friction, plant=plant)
     contest = _Contest(aligned, widened or start)
     chosen: tuple[inputs.InputGain, ...] = ()
-    model = task.model
     try:
         if widened is None:
             raise holdout.StoppedError
         contest.train()
-        if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
+        if isinstance(task.model, NeuroFuzzyModel) and task.model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
     except holdout.StoppedError:
         contest.stop()
-    if chosen:
-        cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+    if isinstance(model, NeuroFuzzyModel) and (chosen or model.selected):
+        model.see([gain.name for gain in chosen] or None)
+        model.selected = bool(chosen)
     found = replace(
         contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
         skipped_horizons=start.skipped_horizons, inputs=chosen,
@@ -106,6 +103,13 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
+
+
+def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
+    """A copy of a neuro-fuzzy model with other inputs."""
+    copied = cast("NeuroFuzzyModel", copy.deepcopy(model))
+    copied.see(names)
+    return copied
 
 
 def _ripple(plant: Plant) -> str:
@@ -123,8 +127,7 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
-    model = copy.deepcopy(task.model)
-    cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+    model = _seeing(task.model, [gain.name for gain in chosen])
     rival = _Contest(replace(seeing, model=model), start)
     new, old, chance = rival.validation, plain.validation, task.options.input_chance
     least = task.options.network_gain
