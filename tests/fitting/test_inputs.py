@@ -30,10 +30,10 @@ from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
     _recurring,
-    _significant,
     candidates,
     chosen_inputs,
     friction_drives,
+    significant,
     widened_start,
     with_position_load,
 )
@@ -184,7 +184,19 @@ def test_an_input_must_differ_from_zero_at_a_joint(name, intervals, expected):
         intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()],
         plant=SimpleNamespace(joint_names=["joint1", "joint2"]),
     )
-    assert _significant(found, name) == expected
+    assert significant(found, name) == expected
+
+
+@pytest.mark.parametrize("where", [set(), {0}])
+def test_heat_and_position_are_described_only_where_they_are_significant(where, monkeypatch):
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    monkeypatch.setattr(neurofuzzy.inputs, "significant", lambda found, name: where)
+    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
+    model = NFCVFM(2, v_smooth=V_SMOOTH, inputs=["position", "heat"])
+    status = fit(model, pendulum(), recording, max_steps=1, **BRIEF).status
+    assert ("Heat cools within" in status) == bool(where)
+    assert ("largest at" in status) == ("(joint1)" in status) == bool(where)
+    assert "(joint2)" not in status
 
 
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])

@@ -42,7 +42,7 @@ from nfriction.fitting.strategy.continuation import (
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.task import FitTask, constant_prior, known_terms, regression, terms_after
 from nfriction.friction.heat import Heated
-from nfriction.friction.inputs import has_input
+from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
@@ -97,9 +97,11 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
-    if has_input(model.law, "position") and widened is not None:
-        said.append(_ripple(found.plant))
-    if has_input(model.law, "heat"):
+    # Only what the constant fit shows: a network's parameters have no intervals.
+    shown = {k: inputs.significant(contest.start, k) for k in INPUTS if has_input(model.law, k)}
+    if shown.get("position"):
+        said.append(_ripple(found.plant, shown["position"]))
+    if shown.get("heat"):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
@@ -112,11 +114,13 @@ def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
     return copied
 
 
-def _ripple(plant: Plant) -> str:
-    """A sentence about the positions where friction is largest."""
-    rows = zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)
-    peaks = (f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in rows)
-    at = ", ".join(peaks)
+def _ripple(plant: Plant, joints: set[int]) -> str:
+    """A sentence about the positions where friction of these joints is largest."""
+    rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
+    at = ", ".join(
+        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({name})"
+        for name, p, k in (rows[j] for j in sorted(joints))
+    )
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
     return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
 
