@@ -16,7 +16,7 @@ from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prio
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.inputs import has_input
+from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
@@ -49,9 +49,17 @@ class FitTask:
 
     def warnings_beside(self, found: FitResult) -> tuple[str, ...]:
         """Those about the data, and on a wide smoothed sign if the residual exceeds the noise."""
-        least = self.options.model_error_ratio * (found.noise or math.inf)
-        above = not self.mistakes and found.residual > least
+        above = not self.mistakes and not self.leaves_noise(found)
         return self.data_warnings + self.smoothed * above
+
+    def leaves_noise(self, found: FitResult) -> bool:
+        """True if no more than noise is left, as far as it is known."""
+        return found.residual <= self.options.model_error_ratio * (found.noise or math.inf)
+
+    def drift_explained(self, found: FitResult) -> bool:
+        """True if friction changes with time by heat, or by inputs that leave only noise."""
+        by = [name for name in INPUTS if has_input(found.model.law, name)]
+        return "heat" in by or (bool(by) and self.leaves_noise(found))
 
 
 def prepare_task(

@@ -212,6 +212,33 @@ def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs,
     assert ("falls by 30 %" in found.usability[1]) == (not inputs)
 
 
+@pytest.mark.parametrize(("name", "explained"), [("direction", True), ("heat", False)])
+def test_inputs_that_leave_only_noise_answer_the_warnings_of_their_law(
+    name, explained, monkeypatch
+) -> None:
+    late, drift = "Perhaps torques are recorded later.", "The friction of joint1 falls by 30 %."
+
+    def begin(task):
+        return constant_start(task).with_warnings([late], unmodelled=[late])
+
+    def choose(plain):
+        task = replace(plain.task, model=neurofuzzy._seeing(plain.task.model, ["direction"]))
+        start = widened_start(task, plain.start, ["direction"])
+        return (InputGain("direction", 0.5, (0.5, 0.1)),), neurofuzzy._Contest(task, start)
+
+    constant_start = neurofuzzy.constant_start
+    monkeypatch.setattr(neurofuzzy, "constant_start", begin)
+    monkeypatch.setattr(neurofuzzy, "_with_chosen_inputs", choose)
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    monkeypatch.setattr(
+        "nfriction.fitting.diagnosis.changing_friction", lambda *_: [("friction", drift)]
+    )
+    recording = swing(pendulum(), truth(name), seconds=2.0)
+    found = fit(NFCVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
+    for warning in (late, drift):
+        assert (warning in found.warnings) == (warning in found.unmodelled) == (not explained)
+
+
 ONE = torch.ones(6, dtype=torch.float64)
 
 
