@@ -40,7 +40,10 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of one input: its name in words, centre and standard deviation in SI units."""
+    """A fuzzy set of one input: its name in words, centre and standard deviation in SI units.
+
+    A centre beyond the trained range is that end of the range, where its rules are evaluated.
+    """
 
     name: str
     centre: float
@@ -107,8 +110,13 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         numbered = [f"speed {k + 1}" for k in range(len(speeds))]
         names_v = _in_order(speeds, _SPEEDS.get(len(speeds), numbered))
         names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
-        v = tuple(map(Term, names_v, speeds, speed_widths))
-        a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
+        names_a = _in_order(accelerations, names_a)
+        held_v, held_a = (
+            c[j].clamp(*ends).tolist()
+            for c, *ends in zip(fuzzy.centres, fuzzy.lower[j], fuzzy.upper[j], strict=True)
+        )
+        v = tuple(map(Term, names_v, held_v, speed_widths))
+        a = tuple(map(Term, names_a, held_a, widths))
         # In the order of the rule table the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
         values = fuzzy.coefficients[j].tolist()

@@ -68,6 +68,18 @@ def test_sets_that_changed_places_change_words():
     assert [t.name for t in of.velocity] == ["very fast", "fast", "medium", "slow", "very slow"]
 
 
+def test_a_set_beyond_the_range_is_named_where_its_rules_hold():
+    model = NFLFM(1, terms=(3, 3))
+    model.schedule.set_range(10.0, [-50.0, 50.0])
+    with torch.no_grad():
+        centres = model.schedule.network.anfis.partition.centres
+        centres[0] = torch.tensor([-0.2, -0.1, 1.1, 0.2, 0.5, 1.5])
+    (of,) = rules_in_words(model)
+    assert [t.name for t in of.velocity] == ["slow", "medium", "fast"]
+    assert [t.centre for t in of.velocity] == [0.0, 0.0, 10.0]
+    assert [t.centre for t in of.acceleration] == pytest.approx([-30.0, 0.0, 50.0])
+
+
 def test_models_without_rules_have_none_and_names_must_fit():
     assert rules_in_words(LFM(2)) == []
     with pytest.raises(ValueError, match="2 names"):
