@@ -22,6 +22,7 @@ from nfriction.evaluation import tables
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN
 from nfriction.friction import both_names
+from nfriction.friction.heat import FALL, HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -62,10 +63,10 @@ class Rule:
     values: tuple[float, ...]
 
     def sentence(self, coefficients: Sequence[tuple[str, str]]) -> str:
-        """The rule in words; `coefficients` are names and units."""
+        """The rule in words; `coefficients` are names and units, those of heat unused."""
         then = " AND ".join(
             f"{name} = {value:.4g} {unit}".rstrip()
-            for (name, unit), value in zip(coefficients, self.values, strict=True)
+            for (name, unit), value in zip(coefficients, self.values, strict=False)
         )
         return f"{self.condition} THEN {then}"
 
@@ -101,6 +102,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     if fuzzy is None:
         return []
     names = tables.joint_labels(joint_names or None, model.joints)
+    varied = sum(c not in (FALL, HEAT) for c in model.law.coefficients)  # heat is last
     described = []
     for j, joint in enumerate(names):
         (speeds, speed_widths), (accelerations, widths) = (
@@ -119,7 +121,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         a = tuple(map(Term, names_a, held_a, widths))
         # In the order of the rule table the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
-        values = fuzzy.coefficients[j].tolist()
+        values = fuzzy.coefficients[j, :, :varied].tolist()
         rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
         described.append(JointRules(joint, v, a, tuple(rules)))
     return described
@@ -291,7 +293,8 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         shown.append(tables.coefficient_table(name, joints, sets, _units(run, name)))
     known = fit.plant | {
         f"{coefficient} of {joint}": value
-        for coefficient, values in sets.get("always", {}).items()
+        for of in sets.values()
+        for coefficient, values in of.items()
         for joint, value in zip(joints, values, strict=True)
     }
     intervals = [
@@ -382,7 +385,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             joints.append({
                 "rules": tables.Table(
                     f"{head}: {len(rows)} rules",
-                    ("rule", *heads, *(["recorded [s]"] if seconds else [])), rows,
+                    ("rule", *heads[: len(of.rules[0].values)], *(["recorded [s]"] if seconds else [])), rows,
                 ),
                 "terms": tables.Table(f"{head}: meaning of the words", columns, terms),
             })  # fmt: skip

@@ -199,6 +199,19 @@ def test_heat_and_position_are_described_only_where_they_are_significant(where, 
     assert "(joint2)" not in status
 
 
+def test_an_accepted_network_has_the_interval_of_the_fall_by_heat(monkeypatch) -> None:
+    monkeypatch.setattr(neurofuzzy, "improves", lambda *_, **__: True)
+    monkeypatch.setattr(neurofuzzy.Validation, "trained_on", lambda self, trial: trial)
+    monkeypatch.setattr(neurofuzzy.Validation, "lost_over_long_windows", lambda self, end: "")
+    recording = swing(pendulum(), truth("heat"), seconds=1.0)
+    model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2, inputs=["heat"])
+    found = fit(model, pendulum(), recording, max_steps=1, **BRIEF)
+    assert found.effective_parameters
+    assert [i.name for i in found.intervals] == ["k_h of joint1", "k_h of joint2"]
+    falls = [i.value for i in found.intervals]
+    assert falls == pytest.approx(model.schedule.rest_coefficients()[:, 2].tolist())
+
+
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
 def test_a_change_of_friction_counts_against_a_network_only_without_heat(inputs, monkeypatch):
     falls = [("friction", "The friction of joint1 falls by 30 %.")]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM
+from nfriction import LFM, NFCVFM, NFLFM
 from nfriction.report import rules_in_words
 from tests.report.runs import neuro_fuzzy
 
@@ -66,6 +66,15 @@ def test_sets_that_changed_places_change_words():
         centres[0, :5] = centres[0, :5].flip(0)
     (of,) = rules_in_words(model)
     assert [t.name for t in of.velocity] == ["very fast", "fast", "medium", "slow", "very slow"]
+
+
+def test_rules_do_not_depend_on_heat():
+    model = NFCVFM(1, [2e-3, 1e-2, 0.3, 0.0], inputs=["heat"])
+    rule = rules_in_words(model)[0].rules[12]
+    assert rule.values == pytest.approx((2e-3, 1e-2))
+    own = [(c.name, c.unit) for c in model.law.coefficients]
+    assert rule.sentence(own) == rule.sentence(own[:2])
+    assert rule.sentence(own).endswith("THEN F_c = 0.002 N m AND F_v = 0.01 N m s/rad")
 
 
 def test_a_set_beyond_the_range_is_named_where_its_rules_hold():

@@ -245,11 +245,15 @@ class _Contest:
         cast("NeuroFuzzy", model.schedule).prior_sd = best.prior_sd
         schedules = (cast("NeuroFuzzy", m.schedule) for m in (found, self.network))
         pairs = zip(*(s.network.anfis.partition.parameters() for s in schedules), strict=True)
+        # Constants of a hidden state, such as the fall by heat, are those of the law's fit.
+        kept = {c.name for c in model.law.coefficients if c.fitted and c.stores}
+        known = tuple(i for i in self.start.intervals if i.name.split(" of ")[0] in kept)
         moved = "" if all(torch.equal(*pair) for pair in pairs) else " Its sets moved."
         return replace(
             result,
             model=model.requires_grad_(False),
             status=result.status + moved,
+            intervals=known + result.intervals,
             effective_parameters=effective_parameters(end),
         )
 
