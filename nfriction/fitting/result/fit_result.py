@@ -52,10 +52,8 @@ class InputGain:
             f"{joint} {100 * share:.0f} %"
             for joint, share in zip(joint_names, self.by_joint, strict=True)
         )
-        return (
-            f"Input {self.name} reduces the unexplained motion by {100 * self.share:.0f} % "
-            f"(with one joint alone: {alone})."
-        )
+        each = f" (with one joint alone: {alone})" if len(joint_names) > 1 else ""
+        return f"Input {self.name} reduces the squared error by {100 * self.share:.0f} %{each}."
 
 
 # Plant terms that are relative changes, each of one buffer: its name and unit.
