@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
+import torch
 
 from nfriction.evaluation.parallel import Data, FitsInterrupted, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
@@ -335,7 +336,7 @@ class Comparison:
                 for part in PART_NAMES
             }
             if fit := self.fits.get(name):
-                models[name]["coefficients"] = coefficient_summary(fit.model)
+                models[name]["coefficients"] = coefficient_summary(fit.model, fit.motions)
                 models[name]["fit"] = fit.to_dict() | {"usability": list(self.rating(name))}
         best, judged = self.best(), None
         if best is not None:
@@ -593,17 +594,26 @@ def _contains(whole: Recording, part: Recording) -> bool:
     return any(np.array_equal(of[k : k + count], data) for k in np.flatnonzero(starts))
 
 
-def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:
-    """Coefficients by range of validity and by name, one value per joint."""
+def coefficients_by_set(
+    model: FrictionModel, motions: Sequence[Motion] = ()
+) -> dict[str, dict[str, list[float]]]:
+    """Coefficients by range of validity and by name, one value per joint.
+
+    With motions also the smallest and largest ones of a network along them.
+    """
+    sets = model.schedule.coefficient_sets()
+    if motions and "at_rest" in sets:
+        qd, qdd = (np.concatenate([getattr(m, k) for m in motions]) for k in ("qd", "qdd"))
+        low, high = model.coefficients(*map(torch.as_tensor, (qd, qdd))).detach().aminmax(dim=0)
+        sets |= {"lowest_in_training": low, "highest_in_training": high}
     # Without the coefficient of heat, because a motion starts cold.
     shown = [(k, c.name) for k, c in enumerate(model.law.coefficients) if c != HEAT]
     return {
-        label: {name: values[:, k].tolist() for k, name in shown}
-        for label, values in model.schedule.coefficient_sets().items()
+        label: {name: values[:, k].tolist() for k, name in shown} for label, values in sets.items()
     }
 
 
-def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
+def coefficient_summary(model: FrictionModel, motions: Sequence[Motion] = ()) -> dict[str, Any]:
     """Coefficients by name, one value per joint; first by set if a model has several."""
-    sets = coefficients_by_set(model)
+    sets = coefficients_by_set(model, motions)
     return sets.get("always", sets)

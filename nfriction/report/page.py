@@ -322,15 +322,17 @@ def _cards(run: Run) -> list[dict[str, Any]]:
         return []
     sets, units = run.coefficients.get(best, {}), _units(run, best)
     cards = []
+    # Of a network those along the recordings, if they are known.
+    ranges = [of for label, of in sets.items() if "_in_training" in label] or [*sets.values()]
     for j, joint in enumerate(run.comparison.joint_names):
         lines = []
         for name in next(iter(sets.values()), {}):
-            values = [of[name][j] for of in sets.values() if name in of]
+            values = [of[name][j] for of in ranges if name in of]
             # A unit stays on the same line as its number.
             unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
-            if len(values) > 1:
+            if min(values) < max(values):
                 ends = map(tables.four_digits, (min(values), max(values)))
                 value = " to ".join(ends) + unit
                 note = "follows the motion"
