@@ -124,7 +124,8 @@ class NeuroFuzzy(Schedule):
             raise ValueError(
                 f"`head_units` must be a whole number of units, got {reprlib.repr(head_units)}."
             )
-        if not isinstance(terms, list | tuple):
+        listed = isinstance(terms, list | tuple)
+        if not listed or not all(isinstance(count, SupportsIndex) for count in terms):
             raise ValueError(
                 "`terms` must be two whole numbers, the fuzzy sets of velocity and of "
                 f"acceleration, got {reprlib.repr(terms)}."

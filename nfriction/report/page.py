@@ -368,6 +368,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             continue
         joints = []
         in_words = rules_in_words(model, run.comparison.joint_names)
+        heads = heads[: len(in_words[0].rules[0].values)]
         fired = run.fits[name].rule_seconds
         for j, of in enumerate(in_words):
             seconds = fired[j] if len(fired) == len(in_words) else ()
@@ -387,7 +388,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             joints.append({
                 "rules": tables.Table(
                     f"{head}: {len(rows)} rules",
-                    ("rule", *heads[: len(of.rules[0].values)], *(["recorded [s]"] if seconds else [])), rows,
+                    ("rule", *heads, *(["recorded [s]"] if seconds else [])), rows,
                 ),
                 "terms": tables.Table(f"{head}: meaning of the words", columns, terms),
             })  # fmt: skip
