@@ -170,10 +170,8 @@ class TorqueFits:
         """
         given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
-        pairs = [*zip(self._models(model), given.joints, strict=True)]
-        for one, joint in pairs:
-            _warn_beyond_range(joint, one.model)
-        return [torque_table.predict(one.model, joint).numpy() for one, joint in pairs]
+        pairs = zip(self._models(model), given.joints, strict=True)
+        return [_predicted(one.model, joint) for one, joint in pairs]
 
     def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
@@ -584,8 +582,7 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     because the model was given its torque. A ripple that is out of phase with the rows is logged.
     """
     joint = joint.sliding
-    _warn_beyond_range(joint, model)
-    torque, rows = torque_table.predict(model, joint).numpy(), slice(None)
+    torque, rows = _predicted(model, joint), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # The initial deflection was estimated from the torque of these rows.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + torque_table.LEAD_IN)), None)
@@ -601,19 +598,19 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     return TorqueScore(joint.name, type(model).__name__, rmse, nrmse)
 
 
-def _warn_beyond_range(joint: JointTorque, model: FrictionModel) -> None:
-    """Log recorded inputs of friction that leave their trained range by over a tenth of it."""
-    if not isinstance(model.schedule, Recorded):
-        return
-    given, followed = recorded_inputs(joint), {*model.schedule.followed()} - {"direction"}
-    for name, (low, high) in zip(TERMS, model.schedule.ranges[0].tolist(), strict=True):
-        if name in followed and name in given:
-            least, most = (float(x) for x in given[name].aminmax())
-            if max(low - least, most - high) > 0.1 * (high - low):
-                logger.warning(
-                    "%s: %s from %.4g to %.4g, but %.4g to %.4g in the fit; beyond, friction "
-                    "stays as at the end of that range.", joint.name, name, least, most, low, high,
-                )  # fmt: skip
+def _predicted(model: FrictionModel, joint: JointTorque) -> Array:
+    """Torque at the rows of a joint; inputs over a tenth beyond the range of the fit are logged."""
+    if isinstance(schedule := model.schedule, Recorded):
+        given, followed = recorded_inputs(joint), {*schedule.followed()} - {"direction", "ripple"}
+        for name, (low, high) in zip(TERMS, schedule.ranges[0].tolist(), strict=True):
+            if name in followed and name in given:
+                least, most = map(float, given[name].aminmax())
+                if max(low - least, most - high) > 0.1 * (high - low):
+                    logger.warning(
+                        "%s: %s from %.4g to %.4g, but %.4g to %.4g in the fit, at whose ends "
+                        "friction is held.", joint.name, name, least, most, low, high,
+                    )  # fmt: skip
+    return torque_table.predict(model, joint).numpy()
 
 
 class SavedModel(NamedTuple):

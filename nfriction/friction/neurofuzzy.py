@@ -463,12 +463,9 @@ class NeuroFuzzyModel(NamedModel):
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
         inputs: quantities other than speed and acceleration on which friction depends:
             `"direction"` of rotation, `"load"` of the bearing or `"position"`, `"heat"` of joints,
-            each with its own coefficient (`with_inputs`); with None, a fit selects the useful ones.
+            each with its own coefficient (`with_inputs`); with None, every fit selects the useful
+            ones, and the model is `selected` (not after loading a file: its inputs are given).
         options: of the coefficients, e.g. `terms=(7, 5)`.
-
-    Attributes:
-        selected: whether a fit selected the inputs; the next one selects again. Inputs from a file
-            count as given.
     """
 
     def __init__(

@@ -41,10 +41,7 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of one input: its name in words, centre and standard deviation in SI units.
-
-    A centre beyond the trained range is that end of the range, where its rules are evaluated.
-    """
+    """A fuzzy set of an input in SI: name, centre (held in the trained range), standard deviation."""
 
     name: str
     centre: float
@@ -113,10 +110,8 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         names_v = _in_order(speeds, _SPEEDS.get(len(speeds), numbered))
         names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
         names_a = _in_order(accelerations, names_a)
-        held_v, held_a = (
-            c[j].clamp(*ends).tolist()
-            for c, *ends in zip(fuzzy.centres, fuzzy.lower[j], fuzzy.upper[j], strict=True)
-        )
+        ends = zip(fuzzy.centres, fuzzy.lower[j], fuzzy.upper[j], strict=True)
+        held_v, held_a = (c[j].clamp(low, high).tolist() for c, low, high in ends)
         v = tuple(map(Term, names_v, held_v, speed_widths))
         a = tuple(map(Term, names_a, held_a, widths))
         # In the order of the rule table the acceleration varies faster.
@@ -326,7 +321,7 @@ def _cards(run: Run) -> list[dict[str, Any]]:
     ranges = [of for label, of in sets.items() if "_in_training" in label] or [*sets.values()]
     for j, joint in enumerate(run.comparison.joint_names):
         lines = []
-        for name in next(iter(sets.values()), {}):
+        for name in next(iter(ranges), {}):
             values = [of[name][j] for of in ranges if name in of]
             # A unit stays on the same line as its number.
             unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""

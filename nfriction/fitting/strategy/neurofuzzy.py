@@ -120,10 +120,11 @@ def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
 def _ripple(plant: Plant, joints: set[int]) -> str:
     """A sentence about the positions where friction of these joints is largest."""
     rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
-    at = ", ".join(
-        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({name})"
-        for name, p, k in (rows[j] for j in sorted(joints))
+    peaks = (rows[j] for j in sorted(joints))
+    every = (
+        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in peaks
     )
+    at = ", ".join(every)
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
     return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
 

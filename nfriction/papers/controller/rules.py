@@ -61,7 +61,6 @@ SI_FACTOR = {
     "1": 1.0,
 }
 """Units in which an input may be written, and their values in SI."""
-# Outputs are coefficients of a law.
 _SI_UNIT = r"|[1-]|(1/)?(N|m|s|rad|kg)(\^\d)?([ /](N|m|s|rad|kg)(\^\d)?)*"
 
 
@@ -129,17 +128,12 @@ class RuleBase:
                     f"input {variable.name!r}: unknown unit {variable.unit!r}; use one of "
                     f"{list(SI_FACTOR)}."
                 )
-        first = self.inputs[0]
-        if len(self.inputs) > 1 and first.unit.endswith("s^2"):
-            raise ValueError(
-                f"input {first.name!r} in {first.unit}: list the velocity, in rad/s or deg/s, first."
-            )
-        for variable in self.outputs:
-            if not re.fullmatch(_SI_UNIT, variable.unit):
-                raise ValueError(
-                    f"output {variable.name!r}: the unit must be of SI without prefixes, such as "
-                    f"'N m s/rad', got {shortened(repr(variable.unit), 40)}; convert its sets."
-                )
+        first, *others = self.inputs
+        if others and first.unit.endswith("s^2"):
+            raise ValueError(f"input {first.name!r} in {first.unit}: list the velocity first.")
+        for v in self.outputs:
+            if not re.fullmatch(_SI_UNIT, v.unit):
+                raise ValueError(f"output {v.name!r} needs SI, such as 'N m', got {v.unit!r}.")
         if not 1 <= len(self.rules) <= MAX_RULES:
             raise ValueError(f"1 to {MAX_RULES} rules are allowed, got {len(self.rules)}.")
         for number, rule in enumerate(self.rules, 1):
