@@ -221,7 +221,7 @@ class RBFNetwork(grouped.LinearOutputModule):
             y: desired outputs, shape (*batch, groups, outputs).
             width: of every unit, relative to the standard deviation of each input.
         Raises:
-            ValueError: if samples are too few, an input never varies, or targets or width are wrong.
+            ValueError: if samples are too few, an input never varies, or targets or width is wrong.
         """
         if not 0 < width < torch.inf:
             raise ValueError(f"`width` must be positive and finite, got {width}.")

@@ -41,7 +41,7 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of an input in SI: name, centre (held in the trained range), standard deviation."""
+    """A fuzzy set of an input in SI: name, centre held in the trained range, standard deviation."""
 
     name: str
     centre: float

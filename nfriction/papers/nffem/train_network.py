@@ -83,7 +83,7 @@ DEFAULTS = TrainingOptions()
 def recorded_losses(
     names: Sequence[str],
 ) -> tuple[dict[str, list[float]], Callable[[EvidenceState], None]]:
-    """Mean squared error after every step by name of the group, and the callback that records it."""
+    """Mean squared error after every step by group name, and the callback that records it."""
     losses: dict[str, list[float]] = {}
 
     def keep(state: EvidenceState) -> None:
