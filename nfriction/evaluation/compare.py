@@ -594,26 +594,27 @@ def _contains(whole: Recording, part: Recording) -> bool:
     return any(np.array_equal(of[k : k + count], data) for k in np.flatnonzero(starts))
 
 
-def coefficients_by_set(
-    model: FrictionModel, motions: Sequence[Motion] = ()
-) -> dict[str, dict[str, list[float]]]:
-    """Coefficients by range of validity and by name, one value per joint.
-
-    With motions also the smallest and largest ones of a network along them.
-    """
-    sets = model.schedule.coefficient_sets()
-    if motions and "at_rest" in sets:
-        qd, qdd = (np.concatenate([getattr(m, k) for m in motions]) for k in ("qd", "qdd"))
-        low, high = model.coefficients(*map(torch.as_tensor, (qd, qdd))).detach().aminmax(dim=0)
-        sets |= {"lowest_in_training": low, "highest_in_training": high}
+def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:
+    """Coefficients by range of validity and by name, one value per joint."""
     # Without the coefficient of heat, because a motion starts cold.
     shown = [(k, c.name) for k, c in enumerate(model.law.coefficients) if c != HEAT]
     return {
-        label: {name: values[:, k].tolist() for k, name in shown} for label, values in sets.items()
+        label: {name: values[:, k].tolist() for k, name in shown}
+        for label, values in model.schedule.coefficient_sets().items()
     }
 
 
 def coefficient_summary(model: FrictionModel, motions: Sequence[Motion] = ()) -> dict[str, Any]:
-    """Coefficients by name, one value per joint; first by set if a model has several."""
-    sets = coefficients_by_set(model, motions)
+    """Coefficients by name, one value per joint; first by set if a model has several.
+
+    Of a network also the smallest and largest ones along the motions of its training.
+    """
+    sets = coefficients_by_set(model)
+    if motions and "at_rest" in sets:
+        qd, qdd = (np.concatenate([getattr(m, k) for m in motions]) for k in ("qd", "qdd"))
+        ends = model.coefficients(*map(torch.as_tensor, (qd, qdd))).detach().aminmax(dim=0)
+        for label, values in zip(("lowest_in_training", "highest_in_training"), ends, strict=True):
+            sets[label] = dict(
+                zip(sets["at_rest"], values.T.tolist(), strict=False)
+            )  # heat is last
     return sets.get("always", sets)
