@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
+import torch
 
 from nfriction.evaluation.parallel import Data, FitsInterrupted, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
@@ -335,7 +336,7 @@ class Comparison:
                 for part in PART_NAMES
             }
             if fit := self.fits.get(name):
-                models[name]["coefficients"] = coefficient_summary(fit.model)
+                models[name]["coefficients"] = coefficient_summary(fit.model, fit.motions)
                 models[name]["fit"] = fit.to_dict() | {"usability": list(self.rating(name))}
         best, judged = self.best(), None
         if best is not None:
@@ -603,7 +604,17 @@ def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]
     }
 
 
-def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
-    """Coefficients by name, one value per joint; first by set if a model has several."""
+def coefficient_summary(model: FrictionModel, motions: Sequence[Motion] = ()) -> dict[str, Any]:
+    """Coefficients by name, one value per joint; first by set if a model has several.
+
+    Of a network also the smallest and largest ones along the motions of its training.
+    """
     sets = coefficients_by_set(model)
+    if motions and "at_rest" in sets:
+        qd, qdd = (np.concatenate([getattr(m, k) for m in motions]) for k in ("qd", "qdd"))
+        ends = model.coefficients(*map(torch.as_tensor, (qd, qdd))).detach().aminmax(dim=0)
+        for label, values in zip(("lowest_in_training", "highest_in_training"), ends, strict=True):
+            sets[label] = dict(
+                zip(sets["at_rest"], values.T.tolist(), strict=False)
+            )  # heat is last
     return sets.get("always", sets)

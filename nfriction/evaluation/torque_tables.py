@@ -19,10 +19,10 @@ from nfriction.evaluation.cross_validation import Candidate, indistinguishable
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting import torque_table
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.recorded import ripple_shift
+from nfriction.fitting.recorded import recorded_inputs, ripple_shift
 from nfriction.fitting.result.paired_test import improves
 from nfriction.friction import model_by_name, model_name, plain_name
-from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, Recorded, unused
+from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, TERMS, Recorded, unused
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
@@ -171,7 +171,7 @@ class TorqueFits:
         given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
         pairs = zip(self._models(model), given.joints, strict=True)
-        return [torque_table.predict(one.model, joint).numpy() for one, joint in pairs]
+        return [_predicted(one.model, joint) for one, joint in pairs]
 
     def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
@@ -582,7 +582,7 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     because the model was given its torque. A ripple that is out of phase with the rows is logged.
     """
     joint = joint.sliding
-    torque, rows = torque_table.predict(model, joint).numpy(), slice(None)
+    torque, rows = _predicted(model, joint), slice(None)
     if joint.time is not None and model.law.memory is not None:
         # The initial deflection was estimated from the torque of these rows.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + torque_table.LEAD_IN)), None)
@@ -596,6 +596,21 @@ def score_joint(joint: JointTorque, model: FrictionModel) -> TorqueScore:
     rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
     nrmse = rmse / (float(joint.tau[rows].std()) or math.nan)
     return TorqueScore(joint.name, type(model).__name__, rmse, nrmse)
+
+
+def _predicted(model: FrictionModel, joint: JointTorque) -> Array:
+    """Torque at the rows of a joint; inputs over a tenth beyond the range of the fit are logged."""
+    if isinstance(schedule := model.schedule, Recorded):
+        given, followed = recorded_inputs(joint), {*schedule.followed()} - {"direction", "ripple"}
+        for name, (low, high) in zip(TERMS, schedule.ranges[0].tolist(), strict=True):
+            if name in followed and name in given:
+                least, most = map(float, given[name].aminmax())
+                if max(low - least, most - high) > 0.1 * (high - low):
+                    logger.warning(
+                        "%s: %s from %.4g to %.4g, but %.4g to %.4g in the fit, at whose ends "
+                        "friction is held.", joint.name, name, least, most, low, high,
+                    )  # fmt: skip
+    return torque_table.predict(model, joint).numpy()
 
 
 class SavedModel(NamedTuple):

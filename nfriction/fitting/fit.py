@@ -19,7 +19,6 @@ from pathlib import Path
 from nfriction.fitting.options import Eccentricity, EncoderReference, FitOptions, Loss, Method
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.task import Callback, FitTask, prepare_task
-from nfriction.friction.inputs import has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import RecordingLike
@@ -119,5 +118,4 @@ def fit(
     found = found.with_own_model().with_warnings(
         task.warnings_beside(found), task.mistakes, unmodelled
     )
-    # A law with heat explains friction that changes with time.
-    return found.without(task.drift) if has_input(found.model.law, "heat") else found
+    return found.without(task.drift) if task.drift_explained(found) else found

@@ -17,7 +17,7 @@ from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prio
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.inputs import has_input
+from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
@@ -50,9 +50,17 @@ class FitTask:
 
     def warnings_beside(self, found: FitResult) -> tuple[str, ...]:
         """Those about the data, and on a wide smoothed sign if the residual exceeds the noise."""
-        least = self.options.model_error_ratio * (found.noise or math.inf)
-        above = not self.mistakes and found.residual > least
+        above = not self.mistakes and not self.leaves_noise(found)
         return self.data_warnings + self.smoothed * above
+
+    def leaves_noise(self, found: FitResult) -> bool:
+        """True if no more than noise is left, as far as it is known."""
+        return found.residual <= self.options.model_error_ratio * (found.noise or math.inf)
+
+    def drift_explained(self, found: FitResult) -> bool:
+        """True if friction changes with time by heat, or by inputs that leave only noise."""
+        by = [name for name in INPUTS if has_input(found.model.law, name)]
+        return "heat" in by or (bool(by) and self.leaves_noise(found))
 
 
 def prepare_task(
@@ -72,7 +80,8 @@ def prepare_task(
     by_name, model = isinstance(model, str), inputs.as_model(model, plant.joints)
     inputs.require_doubles(model, plant)
     inputs.require_elementwise(model.law, model.joints)
-    if plant.has_position_load and not has_input(model.law, "position"):
+    given_position = has_input(model.law, "position") and not getattr(model, "selected", False)
+    if plant.has_position_load and not given_position:
         plant = plant.replace(load_waves=0.0 * plant.load_waves)  # of an earlier fit
     given = inputs.as_recording_list(recordings, plant)
     inputs.require_parts(given, 2 * options.edge)

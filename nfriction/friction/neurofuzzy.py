@@ -78,7 +78,8 @@ class NeuroFuzzy(Schedule):
             that of the sets by evidence.
 
     Attributes:
-        learn_sets: whether a fit moves the sets and the head's units in addition to their weights.
+        learn_sets: whether `parameter_vector` includes the sets and the head's units in addition to
+            their weights; a fit decides by evidence whether they move.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -123,7 +124,8 @@ class NeuroFuzzy(Schedule):
             raise ValueError(
                 f"`head_units` must be a whole number of units, got {reprlib.repr(head_units)}."
             )
-        if not isinstance(terms, list | tuple):
+        listed = isinstance(terms, list | tuple)
+        if not listed or not all(isinstance(count, SupportsIndex) for count in terms):
             raise ValueError(
                 "`terms` must be two whole numbers, the fuzzy sets of velocity and of "
                 f"acceleration, got {reprlib.repr(terms)}."
@@ -461,7 +463,8 @@ class NeuroFuzzyModel(NamedModel):
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`.
         inputs: quantities other than speed and acceleration on which friction depends:
             `"direction"` of rotation, `"load"` of the bearing or `"position"`, `"heat"` of joints,
-            each with its own coefficient (`with_inputs`); with None, a fit selects the useful ones.
+            each with its own coefficient (`with_inputs`); with None, every fit selects the useful
+            ones, and the model is `selected` (not after loading a file: its inputs are given).
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 
@@ -482,11 +485,14 @@ class NeuroFuzzyModel(NamedModel):
         schedule = self.make_schedule(law, joints, initial, **options)
         FrictionModel.__init__(self, law, schedule, v_smooth)
         self.inputs = None if inputs is None else list(inputs)
+        self.selected = False
 
-    def see(self, inputs: Sequence[str]) -> None:
-        """Add further inputs, with initial coefficients."""
+    def see(self, inputs: Sequence[str] | None) -> None:
+        """Replace the further inputs, with an untrained network; a constant law keeps its own."""
+        own = self.schedule.coefficient_sets().get("always")
+        own = None if own is None else own[:, : len(self.definition.names)]
         options = {**self.options(), "inputs": inputs}
-        self.__init__(self.joints, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
+        self.__init__(self.joints, own, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
 
     def options(self) -> dict[str, Any]:
         return super().options() | ({} if self.inputs is None else {"inputs": self.inputs})

@@ -181,8 +181,8 @@ def sets_from_ranges(
 class FuzzyRules:
     """Gaussian sets over |velocity| and acceleration, and the coefficients of every pair of them.
 
-    The coefficients of a rule are those where the memberships of both of its sets are 1; the rules
-    of the first velocity set come first.
+    The coefficients of a rule are those at the centres of its sets, held within the trained range;
+    the rules of the first velocity set come first.
     """
 
     lower: Tensor  # of the trained range of both inputs, (joint, input)

@@ -221,8 +221,10 @@ class RBFNetwork(grouped.LinearOutputModule):
             y: desired outputs, shape (*batch, groups, outputs).
             width: of every unit, relative to the standard deviation of each input.
         Raises:
-            ValueError: if there are too few samples, an input never varies, or targets do not fit.
+            ValueError: if samples are too few, an input never varies, or targets or width is wrong.
         """
+        if not 0 < width < torch.inf:
+            raise ValueError(f"`width` must be positive and finite, got {width}.")
         samples = self._samples(x)
         targets = grouped.targets_of(x, y, self.outputs)
         for group in range(self.groups):

@@ -22,6 +22,7 @@ from nfriction.evaluation import tables
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN
 from nfriction.friction import both_names
+from nfriction.friction.heat import FALL, HEAT
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -40,7 +41,7 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of one input: its name in words, centre and standard deviation in SI units."""
+    """A fuzzy set of an input in SI: name, centre held in the trained range, standard deviation."""
 
     name: str
     centre: float
@@ -59,10 +60,10 @@ class Rule:
     values: tuple[float, ...]
 
     def sentence(self, coefficients: Sequence[tuple[str, str]]) -> str:
-        """The rule in words; `coefficients` are names and units."""
+        """The rule in words; `coefficients` are names and units, those of heat unused."""
         then = " AND ".join(
             f"{name} = {value:.4g} {unit}".rstrip()
-            for (name, unit), value in zip(coefficients, self.values, strict=True)
+            for (name, unit), value in zip(coefficients, self.values, strict=False)
         )
         return f"{self.condition} THEN {then}"
 
@@ -98,6 +99,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     if fuzzy is None:
         return []
     names = tables.joint_labels(joint_names or None, model.joints)
+    varied = sum(c not in (FALL, HEAT) for c in model.law.coefficients)  # heat is last
     described = []
     for j, joint in enumerate(names):
         (speeds, speed_widths), (accelerations, widths) = (
@@ -107,11 +109,14 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         numbered = [f"speed {k + 1}" for k in range(len(speeds))]
         names_v = _in_order(speeds, _SPEEDS.get(len(speeds), numbered))
         names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
-        v = tuple(map(Term, names_v, speeds, speed_widths))
-        a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
+        names_a = _in_order(accelerations, names_a)
+        ends = zip(fuzzy.centres, fuzzy.lower[j], fuzzy.upper[j], strict=True)
+        held_v, held_a = (c[j].clamp(low, high).tolist() for c, low, high in ends)
+        v = tuple(map(Term, names_v, held_v, speed_widths))
+        a = tuple(map(Term, names_a, held_a, widths))
         # In the order of the rule table the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
-        values = fuzzy.coefficients[j].tolist()
+        values = fuzzy.coefficients[j, :, :varied].tolist()
         rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
         described.append(JointRules(joint, v, a, tuple(rules)))
     return described
@@ -283,7 +288,8 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         shown.append(tables.coefficient_table(name, joints, sets, _units(run, name)))
     known = fit.plant | {
         f"{coefficient} of {joint}": value
-        for coefficient, values in sets.get("always", {}).items()
+        for of in sets.values()
+        for coefficient, values in of.items()
         for joint, value in zip(joints, values, strict=True)
     }
     intervals = [
@@ -311,15 +317,17 @@ def _cards(run: Run) -> list[dict[str, Any]]:
         return []
     sets, units = run.coefficients.get(best, {}), _units(run, best)
     cards = []
+    # Of a network those along the recordings, if they are known.
+    ranges = [of for label, of in sets.items() if "_in_training" in label] or [*sets.values()]
     for j, joint in enumerate(run.comparison.joint_names):
         lines = []
-        for name in next(iter(sets.values()), {}):
-            values = [of[name][j] for of in sets.values() if name in of]
+        for name in next(iter(ranges), {}):
+            values = [of[name][j] for of in ranges if name in of]
             # A unit stays on the same line as its number.
             unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
-            if len(values) > 1:
+            if min(values) < max(values):
                 ends = map(tables.four_digits, (min(values), max(values)))
                 value = " to ".join(ends) + unit
                 note = "follows the motion"
@@ -355,6 +363,7 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             continue
         joints = []
         in_words = rules_in_words(model, run.comparison.joint_names)
+        heads = heads[: len(in_words[0].rules[0].values)]
         fired = run.fits[name].rule_seconds
         for j, of in enumerate(in_words):
             seconds = fired[j] if len(fired) == len(in_words) else ()

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from nfriction import CVFM, LFM, NFLFM, LinearAxis, PendulumChain, Recording, Rotor, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
@@ -15,7 +16,7 @@ from nfriction.evaluation.results import write_results
 from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.io.model_file import load_info
 from nfriction.papers.afem.adaptive import ALFM
-from nfriction.signals import kalman_smoother
+from nfriction.signals import Motion, kalman_smoother
 from tests.fitting.recordings import driven_axis, pendulum, swing
 
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
@@ -440,3 +441,10 @@ def test_motion_dependent_coefficients_name_their_reference_motion():
     fuzzy = coefficient_summary(network)
     assert fuzzy["reference"] == {"B": pytest.approx([3.0]), "C": pytest.approx([4.0])}
     assert fuzzy["at_rest"]["C"] != pytest.approx([4.0], rel=1e-3)
+    time = np.linspace(0.0, 1.0, 50)[:, None]
+    motion = Motion(time[:, 0], time, 10.0 * time, -100.0 * time)
+    along = coefficient_summary(network, [motion])
+    passed = network.coefficients(*map(torch.as_tensor, (motion.qd, motion.qdd)))[:, 0, 0].tolist()
+    ends = (along[f"{end}_in_training"]["B"] for end in ("lowest", "highest"))
+    assert [*ends] == [[min(passed)], [max(passed)]]
+    assert min(passed) < max(passed)

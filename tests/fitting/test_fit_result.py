@@ -8,10 +8,11 @@ import torch
 from nfriction import FrictionModel, LinearAxis
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.identifiability import Interval
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CVFM, LFM, NCFM, Stribeck
-from nfriction.friction.neurofuzzy import NFLFM
+from nfriction.friction.neurofuzzy import NFCVFM, NFLFM
 from nfriction.papers.afem.adaptive import ALFM
 from tests.fitting.recordings import driven_axis, pendulum, swing
 
@@ -89,6 +90,18 @@ def test_motion_dependent_coefficients_name_their_reference_motion(
         model.schedule.coefficient_sets()["at_rest" if kind is NFLFM else "low"].flatten().tolist()
     ) < set(table["value"])
     assert result.plot().axes
+
+
+def test_the_fall_by_heat_of_a_network_has_the_interval_of_its_constant_fit(
+    found: FitResult,
+) -> None:
+    model, joint = NFCVFM(1, [2.0, 1.5, 0.3, 0.0], inputs=["heat"]), AXIS.joint_names[0]
+    vector = model.schedule.parameter_vector()
+    model.schedule.set_parameter_vector(vector + 0.1 * torch.arange(len(vector)))
+    fall = Interval(f"k_h of {joint}", 0.3, 0.2, 0.4)
+    table = replace(found, model=model, intervals=(fall,), uncertainty=None).to_pandas()
+    assert [name for name in table.index if "k_h" in name] == [fall.name]
+    assert list(table.loc[fall.name]) == [0.3, 0.2, 0.4, "fitted with the constant law"]
 
 
 def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:

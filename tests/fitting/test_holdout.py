@@ -20,6 +20,7 @@ from nfriction.fitting.strategy.holdout import (
     holdout_windows,
     recording_splits,
     settled,
+    verdict,
 )
 from nfriction.fitting.strategy.neurofuzzy import (
     Validation,
@@ -218,6 +219,16 @@ def test_rejected_network_is_reset(constant, monkeypatch, ratio, status):
     qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(14, 1)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
+
+
+def test_a_verdict_counts_ties():
+    law = torch.ones(9, dtype=F64)
+    few, most = law.clone(), law.clone()
+    few[:6], few[6] = 1.1, 0.9
+    most[:2] = 1.1
+    assert "lower on 1 of 9 (equal on 2); the" in verdict(few, law)
+    assert "lower on 0 of 9 and equal on 7, most of which the law already" in verdict(most, law)
+    assert "lower on 9 of 9 (0 % and" in verdict(0.9 * law, law)
 
 
 def test_law_fitted_to_other_recordings_is_refitted(constant):

@@ -17,7 +17,9 @@ from nfriction import (
     Recording,
     Rotor,
     fit,
+    load,
     rollout,
+    save,
 )
 from nfriction.export import c, mjcf, onnx, torchscript
 from nfriction.fitting.options import FitOptions
@@ -28,10 +30,10 @@ from nfriction.fitting.strategy.inputs import (
     _Choice,
     _of_shared,
     _recurring,
-    _significant,
     candidates,
     chosen_inputs,
     friction_drives,
+    significant,
     widened_start,
     with_position_load,
 )
@@ -96,11 +98,17 @@ def test_input_is_chosen_if_friction_depends_on_it(recorded) -> None:
         assert found[0].share > 0.5
         if len(found) == 1:
             assert found[0].share == pytest.approx(1 - (refitted.residual / law.residual) ** 2)
-        assert "unexplained" in found[0].words(("a", "b"))
     if name == "position":
         torch.testing.assert_close(refitted.plant.load_waves, WAVES)
         off = (refitted.plant.load_phase - PHASES + math.pi) % (2 * math.pi) - math.pi
         assert off.abs().max() < 0.1
+
+
+def test_an_input_is_described_by_its_share_of_the_squared_error() -> None:
+    said = "Input load reduces the squared error by 90 %"
+    assert InputGain("load", 0.9, (0.8,)).words(["a"]) == f"{said}."
+    both = InputGain("load", 0.9, (0.8, 0.1)).words(["a", "b"])
+    assert both == f"{said} (with one joint alone: a 80 %, b 10 %)."
 
 
 def test_law_with_inputs_starts_from_the_fitted_law() -> None:
@@ -187,7 +195,32 @@ def test_input_must_be_nonzero_at_some_joint(name, intervals, expected):
         intervals=[Interval(n, 0.0, *ends) for n, ends in intervals.items()],
         plant=SimpleNamespace(joint_names=["joint1", "joint2"]),
     )
-    assert _significant(found, name) == expected
+    assert significant(found, name) == expected
+
+
+@pytest.mark.parametrize("where", [set(), {0}])
+def test_heat_and_position_are_described_only_where_they_are_significant(where, monkeypatch):
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    monkeypatch.setattr(neurofuzzy.inputs, "significant", lambda found, name: where)
+    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
+    model = NFCVFM(2, v_smooth=V_SMOOTH, inputs=["position", "heat"])
+    status = fit(model, pendulum(), recording, max_steps=1, **BRIEF).status
+    assert ("Heat cools within" in status) == bool(where)
+    assert ("largest at" in status) == ("(joint1)" in status) == bool(where)
+    assert "(joint2)" not in status
+
+
+def test_an_accepted_network_has_the_interval_of_the_fall_by_heat(monkeypatch) -> None:
+    monkeypatch.setattr(neurofuzzy, "improves", lambda *_, **__: True)
+    monkeypatch.setattr(neurofuzzy.Validation, "trained_on", lambda self, trial: trial)
+    monkeypatch.setattr(neurofuzzy.Validation, "lost_over_long_windows", lambda self, end: "")
+    recording = swing(pendulum(), truth("heat"), seconds=1.0)
+    model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2, inputs=["heat"])
+    found = fit(model, pendulum(), recording, max_steps=1, **BRIEF)
+    assert found.effective_parameters
+    assert [i.name for i in found.intervals] == ["k_h of joint1", "k_h of joint2"]
+    falls = [i.value for i in found.intervals]
+    assert falls == pytest.approx(model.schedule.rest_coefficients()[:, 2].tolist())
 
 
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
@@ -201,6 +234,33 @@ def test_friction_change_counts_against_a_network_only_without_heat(inputs, monk
     found = fit(model, pendulum(), recording, start=law, max_steps=1, **BRIEF)
     assert (falls[0][1] in found.warnings) == (not inputs)
     assert ("falls by 30 %" in found.usability[1]) == (not inputs)
+
+
+@pytest.mark.parametrize(("name", "explained"), [("direction", True), ("heat", False)])
+def test_inputs_that_leave_only_noise_answer_the_warnings_of_their_law(
+    name, explained, monkeypatch
+) -> None:
+    late, drift = "Perhaps torques are recorded later.", "The friction of joint1 falls by 30 %."
+
+    def begin(task):
+        return constant_start(task).with_warnings([late], unmodelled=[late])
+
+    def choose(plain):
+        task = replace(plain.task, model=neurofuzzy._seeing(plain.task.model, ["direction"]))
+        start = widened_start(task, plain.start, ["direction"])
+        return (InputGain("direction", 0.5, (0.5, 0.1)),), neurofuzzy._Contest(task, start)
+
+    constant_start = neurofuzzy.constant_start
+    monkeypatch.setattr(neurofuzzy, "constant_start", begin)
+    monkeypatch.setattr(neurofuzzy, "_with_chosen_inputs", choose)
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    monkeypatch.setattr(
+        "nfriction.fitting.diagnosis.changing_friction", lambda *_: [("friction", drift)]
+    )
+    recording = swing(pendulum(), truth(name), seconds=2.0)
+    found = fit(NFCVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
+    for warning in (late, drift):
+        assert (warning in found.warnings) == (warning in found.unmodelled) == (not explained)
 
 
 ONE = torch.ones(6, dtype=torch.float64)
@@ -273,6 +333,35 @@ def test_inputs_must_improve_the_network_and_not_worsen_its_law(
     assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
     assert found.task.model.inputs == ["direction"]
     assert task.model.inputs is None
+
+
+def test_inputs_that_a_fit_selected_are_selected_again(monkeypatch, tmp_path) -> None:
+    seen = []
+
+    def choose(plain):
+        seen.append(plain.task.model.law)
+        assert not plain.task.plant.has_position_load
+        if len(seen) == 2:
+            return (), plain
+        task = with_position_load(plain.task, plain.start)
+        task = replace(task, model=neurofuzzy._seeing(task.model, ["position"]))
+        start = widened_start(task, plain.start, ["position"])
+        return (InputGain("position", 0.5, (0.5, 0.1)),), neurofuzzy._Contest(task, start)
+
+    monkeypatch.setattr(neurofuzzy, "_with_chosen_inputs", choose)
+    monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
+    recording, model = swing(pendulum(), truth("nothing"), seconds=1.0), NFCVFM(2)
+    settings = {"max_steps": 2, **BRIEF}
+    found = fit(model, pendulum(), recording, **settings)
+    assert model.inputs == found.model.inputs == ["position"]
+    assert found.plant.has_position_load
+    saved = load(save(model, tmp_path / "model.json"))
+    again = fit(model, found.plant, recording, **settings)
+    assert model.inputs is again.model.inputs is None
+    assert seen == [COULOMB_VISCOUS] * 2
+    # Those of a file count as given.
+    assert fit(saved, pendulum(), recording, **settings).model.inputs == ["position"]
+    assert len(seen) == 2
 
 
 @pytest.mark.slow

@@ -79,6 +79,17 @@ def test_prior_with_the_best_predictions_is_chosen(constant, monkeypatch, best):
 
 
 @pytest.mark.usefixtures("sets_stay")
+def test_a_fit_of_a_model_that_learns_its_sets_starts_from_the_same_sets(constant):
+    recording, law = constant
+    models = [NFLFM(1, v_smooth=V_SMOOTH, **SMALL) for _ in range(2)]
+    models[1].schedule.learn_sets = True
+    for model in models:
+        fit(model, one_link(), recording, start=law, **BRIEF, fit_plant=False)
+    one, other = (model.state_dict() for model in models)
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+@pytest.mark.usefixtures("sets_stay")
 @pytest.mark.parametrize(("ratio", "kept"), [(0.75, True), (1.25, False)])
 @pytest.mark.parametrize("same_windows", [True, False])
 def test_network_worse_than_its_law_on_long_windows_is_rejected(

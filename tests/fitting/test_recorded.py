@@ -67,6 +67,18 @@ def test_different_encoder_zero_is_named(
     assert record.args[1] == pytest.approx(0.25 * PERIOD, abs=PERIOD / 24)  # type: ignore[index]
 
 
+def test_temperatures_that_the_fit_did_not_have_are_named(
+    found: TorqueFits, caplog: pytest.LogCaptureFixture
+) -> None:
+    hot = recorded(seed=6)
+    hot["temperature"] += 20.0
+    for judge in (found.score, found.predict):
+        caplog.clear()
+        judge(hot)
+        (record,) = caplog.records
+        assert "temperature from 40 to 70, but 20 to 50 in the fit" in record.getMessage()
+
+
 def test_inputs_without_effect_on_friction_are_dropped() -> None:
     found = fit_torque(recorded(ripple=0.0, warm=0.0), "slip,neuro-fuzzy:slip")
     assert found.chosen == {"joint1": "Slip"}

@@ -298,7 +298,7 @@ def test_values_that_are_no_numbers_are_refused_by_name() -> None:
         Constant("viscous", 1)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("terms", [5, None, "55"])
+@pytest.mark.parametrize("terms", [5, None, "55", (3.0, 3), ("3", 3)])
 def test_the_network_has_two_inputs(terms: object) -> None:
     with pytest.raises(ValueError, match="`terms` must be two whole numbers"):
         NFLFM(1, terms=terms)

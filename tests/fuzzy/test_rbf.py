@@ -157,6 +157,13 @@ def test_more_units_fit_better(place: str) -> None:
     assert errors[2] < 0.3 * errors[1] < 0.3 * errors[0]
 
 
+@pytest.mark.parametrize("width", [0, -1.0, float("nan")])
+def test_a_width_that_is_not_positive_is_refused(width: float) -> None:
+    x = samples(20, 1, 2)
+    with pytest.raises(ValueError, match="`width` must be positive and finite"):
+        RBFNetwork(1, units=3).init_ols(x, surface(x), width=width)
+
+
 def test_head_is_zero_at_the_start_and_improves_when_solved() -> None:
     x = samples(500, 2, 2)
     y = surface(x)

@@ -15,6 +15,7 @@ from nfriction import LFM, NFLFM, ModelInfo, save
 from nfriction.evaluation.tables import Table, error_table
 from nfriction.plots import style
 from nfriction.report import read_run, to_html
+from nfriction.report.page import _cards
 from tests.report.runs import EVIL, JOINTS, results, write
 
 
@@ -158,6 +159,18 @@ def test_rejected_network_has_no_rules_and_unnamed_rig_is_marked(tmp_path):
     assert "Its network was rejected" in text
     assert "THEN" not in text
     assert "Rig: unnamed." in text
+
+
+def test_a_coefficient_of_a_network_ranges_over_its_recordings(tmp_path):
+    content = results()
+    content["best"]["model"] = "NFLFM"
+    sets = content["models"]["NFLFM"]["coefficients"]
+    sets["lowest_in_training"] = {"B": [4e-3, 5e-3], "C": [6e-3, 1e-2]}
+    sets["highest_in_training"] = {"B": [8e-3, 9e-3], "C": [7e-3, 1e-2]}
+    first, second = _cards(read_run(write(tmp_path, content)))
+    shown = [line["value"].split("\N{NO-BREAK SPACE}")[0] for line in first["lines"]]
+    assert shown == ["0.004 to 0.008", "0.006 to 0.007"]
+    assert [line["note"] for line in second["lines"]] == ["follows the motion", ""]
 
 
 def test_errors_within_the_limit_of_the_least_are_grey(tmp_path):

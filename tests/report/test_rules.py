@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM
+from nfriction import LFM, NFCVFM, NFLFM
 from nfriction.report import rules_in_words
 from tests.report.runs import neuro_fuzzy
 
@@ -66,6 +66,27 @@ def test_swapped_sets_swap_words():
         centres[0, :5] = centres[0, :5].flip(0)
     (of,) = rules_in_words(model)
     assert [t.name for t in of.velocity] == ["very fast", "fast", "medium", "slow", "very slow"]
+
+
+def test_rules_do_not_depend_on_heat():
+    model = NFCVFM(1, [2e-3, 1e-2, 0.3, 0.0], inputs=["heat"])
+    rule = rules_in_words(model)[0].rules[12]
+    assert rule.values == pytest.approx((2e-3, 1e-2))
+    own = [(c.name, c.unit) for c in model.law.coefficients]
+    assert rule.sentence(own) == rule.sentence(own[:2])
+    assert rule.sentence(own).endswith("THEN F_c = 0.002 N m AND F_v = 0.01 N m s/rad")
+
+
+def test_a_set_beyond_the_range_is_named_where_its_rules_hold():
+    model = NFLFM(1, terms=(3, 3))
+    model.schedule.set_range(10.0, [-50.0, 50.0])
+    with torch.no_grad():
+        centres = model.schedule.network.anfis.partition.centres
+        centres[0] = torch.tensor([-0.2, -0.1, 1.1, 0.2, 0.5, 1.5])
+    (of,) = rules_in_words(model)
+    assert [t.name for t in of.velocity] == ["slow", "medium", "fast"]
+    assert [t.centre for t in of.velocity] == [0.0, 0.0, 10.0]
+    assert [t.centre for t in of.acceleration] == pytest.approx([-30.0, 0.0, 50.0])
 
 
 def test_models_without_rules_have_none_and_names_must_fit():

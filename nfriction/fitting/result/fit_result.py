@@ -52,10 +52,8 @@ class InputGain:
             f"{joint} {100 * share:.0f} %"
             for joint, share in zip(joint_names, self.by_joint, strict=True)
         )
-        return (
-            f"Input {self.name} reduces the unexplained motion by {100 * self.share:.0f} % "
-            f"(with one joint alone: {alone})."
-        )
+        each = f" (with one joint alone: {alone})" if len(joint_names) > 1 else ""
+        return f"Input {self.name} reduces the squared error by {100 * self.share:.0f} %{each}."
 
 
 # Plant terms that are relative changes, each of one buffer: its name and unit.
@@ -296,21 +294,25 @@ class FitResult:
 
         joints, schedule = self.plant.joint_names, self.model.schedule
         rows: dict[str, tuple[float, float, float]] = {}
-        for label, values in schedule.coefficient_sets().items():
+        own = {i.name: (i.value, i.low, i.high) for i in self.intervals}
+        sets = schedule.coefficient_sets()
+        for label, values in sets.items():
             where = "" if label == "always" else f", {label.replace('_', ' ')}"
             for joint, of_joint in zip(joints, values.tolist(), strict=True):
                 for c, value in zip(self.model.law.coefficients, of_joint, strict=True):
-                    if c != HEAT:
+                    if c != HEAT and not (where and f"{c.name} of {joint}" in own):
                         rows[f"{c.name} of {joint}{where}"] = (value, math.nan, math.nan)
-        rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
+        rows |= own
         table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
         unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
         notes = dict.fromkeys(rows, "") | dict.fromkeys(self.at_bounds, "at a bound")
         names = zip(schedule.coefficient_names, schedule.fitted_mask, strict=True)
         kept = [name for name, fitted in names if not fitted]
-        # A constant term of a network has an interval.
-        unfitted = [name for name, (_, low, _) in rows.items() if math.isnan(low)]
-        notes |= {name: "not fitted" for name in unfitted if name.split(" of ")[0] in kept}
+        # A constant term of a network has an interval, from the fit of its law.
+        of_law = "" if "always" in sets else "fitted with the constant law"
+        for name, (_, low, _) in rows.items():
+            if name.split(" of ")[0] in kept:
+                notes[name] = "not fitted" if math.isnan(low) else notes[name] or of_law
         notes |= dict.fromkeys(unknown, "not identifiable")
         table["note"] = [notes[name] for name in rows]
         return table.rename_axis("parameter")

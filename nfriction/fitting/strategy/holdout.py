@@ -70,12 +70,15 @@ def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float 
     change = 100 * (math.sqrt(float(network.sum() / law.sum())) - 1)
     if math.isinf(change):
         return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
-    better = int((network < law).sum())
+    better, tied = int((network < law).sum()), int((network == law).sum())
+    ties = f" (equal on {tied})" if tied else ""
+    if 2 * tied > len(law):  # errors count as no smaller than the noise
+        ties = f" and equal on {tied}, most of which the law already explains to the noise"
     gain = f" ({100 * (least - 1):.0f} % and more than the scatter are required)"
     return (
         f"Network rejected: its error on hold-out {blocks} was {abs(change):.3g} % "
         f"{'more' if change > 0 else 'less'} than that of its constant law, and lower on {better} "
-        f"of {len(law)}{'' if change > 0 else gain}; the constant law is kept."
+        f"of {len(law)}{ties}{'' if change > 0 else gain}; the constant law is kept."
     )
 
 

@@ -327,7 +327,7 @@ def chosen_inputs(
         widened = widened_start(widening, start, [*held, gain.name])
         if widened is None:
             raise StoppedError
-        where = _significant(widened, gain.name)
+        where = significant(widened, gain.name)
         if gain.name == "position" and where:
             where &= _recurring(task, start, seeing=widening)
         if widened.residual < at.residual and where:
@@ -341,7 +341,7 @@ def chosen_inputs(
             names = tuple(n for n in names if n != gain.name)
 
 
-def _significant(found: FitResult, name: str) -> set[int]:
+def significant(found: FitResult, name: str) -> set[int]:
     """Joints at which the 95 % interval of an input's coefficient does not include zero.
 
     The intervals take into account that residuals are correlated, unlike the evidence.

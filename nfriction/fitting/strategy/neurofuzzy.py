@@ -41,9 +41,8 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.task import FitTask, constant_prior, known_terms, regression, terms_after
-from nfriction.friction.coefficients import Constant
 from nfriction.friction.heat import Heated
-from nfriction.friction.inputs import has_input
+from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
@@ -61,15 +60,13 @@ INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
+    model = task.model
+    if isinstance(model, NeuroFuzzyModel) and model.selected:
+        task = replace(task, model=_seeing(model, None))  # those of an earlier fit do not count
     given = (isinstance(task.model, NeuroFuzzyModel) and task.model.inputs) or ()
     task = replace(task, plant=inputs.seeing_plant(task.plant, given))
-    widens, own = bool({"heat", "position"} & {*given}), task
-    if widens:
-        law = cast("NeuroFuzzyModel", task.model).definition
-        values = task.model.schedule.coefficient_sets().get("always")
-        values = None if values is None else values[:, : len(law.names)]
-        cold = FrictionModel(law, Constant(law, task.model.joints, values), task.model.v_smooth)
-        own = replace(task, model=cold)
+    widens = bool({"heat", "position"} & {*given})
+    own = replace(task, model=_seeing(model, ())) if widens else task
     start = constant_start(own)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
@@ -84,35 +81,50 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         start = replace(start, model=fitter.friction, plant=plant)
     contest = _Contest(aligned, widened or start)
     chosen: tuple[inputs.InputGain, ...] = ()
-    model = task.model
     try:
         if widened is None:
             raise holdout.StoppedError
         contest.train()
-        if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
+        if isinstance(task.model, NeuroFuzzyModel) and task.model.inputs is None:
             chosen, contest = _with_chosen_inputs(contest)
     except holdout.StoppedError:
         contest.stop()
-    if chosen:
-        cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+    if isinstance(model, NeuroFuzzyModel) and (chosen or model.selected):
+        model.see([gain.name for gain in chosen] or None)
+        model.selected = bool(chosen)
     found = replace(
         contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
         skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
-    if has_input(model.law, "position") and widened is not None:
-        said.append(_ripple(found.plant))
-    if has_input(model.law, "heat"):
+    # Only what the constant fit shows: a network's parameters have no intervals.
+    shown = {k: inputs.significant(contest.start, k) for k in INPUTS if has_input(model.law, k)}
+    if shown.get("position"):
+        said.append(_ripple(found.plant, shown["position"]))
+    if shown.get("heat"):
         said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
     found = replace(found, status=" ".join([found.status, *said]))
+    richer = contest.accepted or contest.start is not start
+    if richer and task.leaves_noise(found):
+        return found  # without what the fit of the law alone warned of, such as a delay
     return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
 
 
-def _ripple(plant: Plant) -> str:
-    """A sentence about the positions where friction is largest."""
-    rows = zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)
-    peaks = (f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in rows)
-    at = ", ".join(peaks)
+def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
+    """A copy of a neuro-fuzzy model with other inputs."""
+    copied = cast("NeuroFuzzyModel", copy.deepcopy(model))
+    copied.see(names)
+    return copied
+
+
+def _ripple(plant: Plant, joints: set[int]) -> str:
+    """A sentence about the positions where friction of these joints is largest."""
+    rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
+    peaks = (rows[j] for j in sorted(joints))
+    every = (
+        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in peaks
+    )
+    at = ", ".join(every)
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
     return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
 
@@ -123,8 +135,7 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...]
     chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
-    model = copy.deepcopy(task.model)
-    cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+    model = _seeing(task.model, [gain.name for gain in chosen])
     rival = _Contest(replace(seeing, model=model), start)
     new, old, chance = rival.validation, plain.validation, task.options.input_chance
     least = task.options.network_gain
@@ -235,11 +246,15 @@ class _Contest:
         cast("NeuroFuzzy", model.schedule).prior_sd = best.prior_sd
         schedules = (cast("NeuroFuzzy", m.schedule) for m in (found, self.network))
         pairs = zip(*(s.network.anfis.partition.parameters() for s in schedules), strict=True)
+        # Constants of a hidden state, such as the fall by heat, are those of the law's fit.
+        kept = {c.name for c in model.law.coefficients if c.fitted and c.stores}
+        known = tuple(i for i in self.start.intervals if i.name.split(" of ")[0] in kept)
         moved = "" if all(torch.equal(*pair) for pair in pairs) else " Its sets moved."
         return replace(
             result,
             model=model.requires_grad_(False),
             status=result.status + moved,
+            intervals=known + result.intervals,
             effective_parameters=effective_parameters(end),
         )
 
@@ -263,10 +278,11 @@ def initialise_from_constant(
 ) -> FrictionModel:
     """A copy of a neuro-fuzzy model set to a constant fit of its law, for the range of the motion.
 
-    Its network is zero; recordings and motions are in joint coordinates.
+    Its network's output is zero; recordings and motions are in joint coordinates.
     """
     network = copy.deepcopy(model)
     schedule = cast("NeuroFuzzy", network.schedule)
+    schedule.learn_sets = False  # only its weights become zero; sets move later, by evidence
     scale = coefficient_scale(model, constant.plant, recordings, motions)
     schedule.set_range(*input_range(motions, schedule.along_motion, options))
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)

@@ -23,16 +23,18 @@ A file looks like this (see also `nfriction/papers/controller/data/`)::
 A set is given by the range [low, high] that it spans (`membership.sets_from_ranges`) or, for full
 control, by `{"shape": "gaussian", "parameters": [centre, sigma]}` with a shape of
 `membership.SHAPES`; all sets of a variable use the same form. Sets are listed from the smallest
-values to the largest. The universe may be omitted if ranges define it. The table has one row for
-each set of the other input, with one cell for each set of the input named in `columns`, in order; a
-cell gives one term per output, in order. Instead of `table`, `rules` may list rules one by one for
-any number of inputs: `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
+values to the largest, the velocity before the acceleration; outputs are in SI units. The universe
+may be omitted if ranges define it. The table has one row for each set of the other input, with one
+cell for each set of the input named in `columns`, in order; a cell gives one term per output, in
+order. Instead of `table`, `rules` may list rules one by one for any number of inputs:
+`{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import reprlib
 from dataclasses import dataclass
 from itertools import pairwise
@@ -59,6 +61,7 @@ SI_FACTOR = {
     "1": 1.0,
 }
 """Units in which an input may be written, and their values in SI."""
+_SI_UNIT = r"|[1-]|(1/)?(N|m|s|rad|kg)(\^\d)?([ /](N|m|s|rad|kg)(\^\d)?)*"
 
 
 @dataclass(frozen=True)
@@ -125,6 +128,12 @@ class RuleBase:
                     f"input {variable.name!r}: unknown unit {variable.unit!r}; use one of "
                     f"{list(SI_FACTOR)}."
                 )
+        first, *others = self.inputs
+        if others and first.unit.endswith("s^2"):
+            raise ValueError(f"input {first.name!r} in {first.unit}: list the velocity first.")
+        for v in self.outputs:
+            if not re.fullmatch(_SI_UNIT, v.unit):
+                raise ValueError(f"output {v.name!r} needs SI, such as 'N m', got {v.unit!r}.")
         if not 1 <= len(self.rules) <= MAX_RULES:
             raise ValueError(f"1 to {MAX_RULES} rules are allowed, got {len(self.rules)}.")
         for number, rule in enumerate(self.rules, 1):

@@ -62,6 +62,7 @@ class EvidenceState:
     beta: float = 1.0  # noise precision
     damping: float = FIRST_DAMPING  # mu of the next step
     step: int = 0
+    network: int = 0  # number of the one in training, of several
 
 
 Callback: TypeAlias = Callable[[EvidenceState], "bool | None"]

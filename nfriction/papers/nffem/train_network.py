@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -87,10 +87,7 @@ def recorded_losses(
     losses: dict[str, list[float]] = {}
 
     def keep(state: EvidenceState) -> None:
-        # The training of each group counts its steps from 1.
-        if state.step == 1:
-            losses[names[len(losses)]] = []
-        losses[[*losses][-1]].append(0.5 / state.beta)
+        losses.setdefault(names[state.network], []).append(0.5 / state.beta)
 
     return losses, keep
 
@@ -327,6 +324,8 @@ class NetworkGroup:
             self.layer.solve_head(self.x, self.y)
             prior = {f"anfis.{name}": value for name, value in prior.items()}
             prior |= {f"head.{name}": value for name, value in _moving(self.layer.head).items()}
+        if (told := options.callback) is not None:
+            options = replace(options, callback=lambda s: told(replace(s, network=self.group)))
         return _regularised(self.layer, self.x, self.y, prior, options)
 
     def _thinned(self, most: int) -> tuple[Tensor, Tensor]:

@@ -214,12 +214,12 @@ def make(
 
 
 def sample_count(duration: float) -> int:
-    """Number of samples in a recording of `duration` [s]; raises if that is too short."""
+    """Number of samples in a recording of `duration` [s]; raises if that is too short or long."""
     samples = round(duration * RATE)
-    if samples < MINIMUM_SAMPLES:
+    if not MINIMUM_SAMPLES <= samples <= 1000 * RATE:  # 2 GB of memory
         raise ValueError(
-            f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, got {duration}; "
-            f"{QUICK_DURATION:g} s is enough for a quick look."
+            f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, at most 1000 s, got "
+            f"{duration}; {QUICK_DURATION:g} s is enough for a quick look."
         )
     return samples
 

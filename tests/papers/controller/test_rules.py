@@ -57,6 +57,13 @@ def test_table_gives_one_rule_per_cell() -> None:
     assert rules.inputs[1].universe == (-9000, 9000)
 
 
+@pytest.mark.parametrize("unit", ["N m", "-", "1", "rad/s", "s/rad", "N m s^2/rad^2", "1/s"])
+def test_outputs_may_be_in_the_units_of_coefficients(unit: str) -> None:
+    content = small()
+    content["outputs"]["B"]["unit"] = unit
+    assert parse_rules(json.dumps(content)).outputs[0].unit == unit
+
+
 def test_columns_may_be_either_input() -> None:
     turned = small()
     turned["table"] = {
@@ -122,6 +129,9 @@ CHANGES = [
     (_set("table", "driving", to="low"), "needs a cell"),
     (_set(*VELOCITY, "unit", to="km/h"), "unknown unit"),
     (_set(*VELOCITY, "unit", to=3), "expected text"),
+    (_set(*VELOCITY, "unit", to="rad/s^2"), "list the velocity first"),
+    (_set("outputs", "B", "unit", to="mN m s/rad"), "needs SI"),
+    (_set("outputs", "B", "unit", to="bananas"), "needs SI"),
     (_set(*VELOCITY, "sets", "slow", to=[300, 0]), "low < high"),
     (_set(*VELOCITY, "sets", "fast", to=[-100, 200]), "ascend"),
     (_set(*VELOCITY, "sets", "fast", to=[200, 1e999]), "finite"),

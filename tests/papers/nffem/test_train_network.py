@@ -16,6 +16,7 @@ from nfriction.papers.nffem.projection import Scaling, one_group, to_own_units
 from nfriction.papers.nffem.train_network import (
     TrainingOptions,
     controller_targets,
+    recorded_losses,
     train_network,
     train_on_controller,
 )
@@ -230,3 +231,16 @@ def test_inconsistent_sizes_are_refused_on_entry() -> None:
         train_on_controller(network, [paper_controller(2)] * 2)
     with pytest.raises(ValueError, match="at least 1"):
         controller_targets(paper_controller(2), 0)
+
+
+def test_losses_are_those_of_their_own_joint() -> None:
+    """Also if a joint takes no step, such as one with constant outputs."""
+    random = torch.Generator().manual_seed(0)
+    x = torch.rand(400, 2, 2, dtype=torch.float64, generator=random)
+    y = torch.stack([torch.full_like(x[:, 0], 3.0), x[:, 1].square()], 1)
+    network = RBFNetwork(2, 2, 6, 2)
+    network.init_kmeans(x)
+    losses, keep = recorded_losses(["joint1", "joint2"])
+    fits = train_network(network, x, y, TrainingOptions(callback=keep, max_steps=3))
+    assert fits[0].steps == 0
+    assert {name: len(of) for name, of in losses.items()} == {"joint2": fits[1].steps}
