@@ -92,7 +92,7 @@ def test_motion_dependent_coefficients_name_their_reference_motion(
     assert result.plot().axes
 
 
-def test_the_fall_by_heat_of_a_network_has_the_interval_of_its_constant_fit(
+def test_decrease_by_heat_has_the_interval_of_the_constant_fit(
     found: FitResult,
 ) -> None:
     model, joint = NFCVFM(1, [2.0, 1.5, 0.3, 0.0], inputs=["heat"]), AXIS.joint_names[0]

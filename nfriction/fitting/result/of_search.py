@@ -173,8 +173,7 @@ def result_from_shooting(
         + tuple(text for text, _ in gains)
         + (PROPORTIONAL,) * (not problem.windows.tau.any())
         + too_few_steps(
-            problem.plant_at(vector), model,
-            max(r.longest_step for r in problem.windows.recordings), problem.options,
+            problem.plant_at(vector), model, float(problem.windows.step.max()), problem.options
         )
         + rotor_warning(problem, at_bounds, at_most)
         + tuple(offset_warnings(problem, vector, intervals, model, motions))

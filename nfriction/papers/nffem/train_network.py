@@ -324,8 +324,8 @@ class NetworkGroup:
             self.layer.solve_head(self.x, self.y)
             prior = {f"anfis.{name}": value for name, value in prior.items()}
             prior |= {f"head.{name}": value for name, value in _moving(self.layer.head).items()}
-        if (told := options.callback) is not None:
-            options = replace(options, callback=lambda s: told(replace(s, network=self.group)))
+        if (callback := options.callback) is not None:
+            options = replace(options, callback=lambda s: callback(replace(s, network=self.group)))
         return _regularised(self.layer, self.x, self.y, prior, options)
 
     def _thinned(self, most: int) -> tuple[Tensor, Tensor]:
