@@ -614,7 +614,6 @@ def coefficient_summary(model: FrictionModel, motions: Sequence[Motion] = ()) ->
         qd, qdd = (np.concatenate([getattr(m, k) for m in motions]) for k in ("qd", "qdd"))
         ends = model.coefficients(*map(torch.as_tensor, (qd, qdd))).detach().aminmax(dim=0)
         for label, values in zip(("lowest_in_training", "highest_in_training"), ends, strict=True):
-            sets[label] = dict(
-                zip(sets["at_rest"], values.T.tolist(), strict=False)
-            )  # heat is last
+            # The coefficient of heat is last, and not in the sets.
+            sets[label] = dict(zip(sets["at_rest"], values.T.tolist(), strict=False))
     return sets.get("always", sets)

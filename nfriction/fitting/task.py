@@ -122,11 +122,11 @@ def prepare_task(
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
     corrected: tuple[str, ...] = ()
+    rig = mistakes[0].rig if mistakes else None
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
-    if options.fit_plant and not inputs.largest_torques(joint).any() and mistakes:
-        for rig in (m.rig for m in mistakes[:1] if m.rig is not None):
-            corrected, plant = (diagnosis.correction_note(stated, mistakes[0]),), rig
-            stated, mistakes = diagnosed(plant)
+    if rig is not None and options.fit_plant and not inputs.largest_torques(joint).any():
+        corrected, plant = (diagnosis.correction_note(stated, mistakes[0]),), rig
+        stated, mistakes = diagnosed(plant)
     named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
         # A fit to such data may take minutes, and would report this only at its end.

@@ -102,7 +102,10 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     if shown.get("position"):
         said.append(_ripple(found.plant, shown["position"]))
     if shown.get("heat"):
-        said.append(f"Heat cools within {cast('Heated', model.schedule).cooling_time:.2g} s.")
+        cooling_time = cast("Heated", model.schedule).cooling_time
+        slow = cooling_time > inputs.longest_duration(motions)
+        longer = ", longer than the recordings last" * slow
+        said.append(f"Heat cools within {cooling_time:.2g} s{longer}.")
     found = replace(found, status=" ".join([found.status, *said]))
     richer = contest.accepted or contest.start is not start
     if richer and task.leaves_noise(found):
@@ -120,11 +123,10 @@ def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
 def _ripple(plant: Plant, joints: set[int]) -> str:
     """A sentence about the positions where friction of these joints is largest."""
     rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
-    peaks = (rows[j] for j in sorted(joints))
-    every = (
-        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {plant.unit} ({n})" for n, p, k in peaks
+    peaks, unit = (rows[j] for j in sorted(joints)), plant.unit
+    at = ", ".join(
+        f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {unit} ({n})" for n, p, k in peaks
     )
-    at = ", ".join(every)
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
     return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
 
