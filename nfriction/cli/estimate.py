@@ -219,17 +219,18 @@ def _conclusion(comparison: Comparison) -> str:
     best = comparison.best() or NO_FRICTION
     if best == NO_FRICTION or comparison.rating(best)[0] == "do not use":
         return ""
-    error, unit = comparison.table()["all"], comparison.unit
+    over, unit = comparison.judged_over(), comparison.unit
+    error, lasting = comparison.table(over)["all"], f" of {over} s" * bool(over)
     without, learnt = float(error[NO_FRICTION]), float(error[best])
     # Without friction a mechanism may turn over: thousands of milliradians are hard to imagine.
     shown = [f"{x:.3g} {unit}" if x >= 1 else f"{1e3 * x:.3g} m{unit}" for x in (without, learnt)]
     end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
     if not math.isfinite(without):
-        return f"Without friction, simulations of the test recordings diverge;\n{end}."
+        return f"Without friction, simulations{lasting} of the test recordings diverge;\n{end}."
     less = math.floor(1e4 * (1 - learnt / without)) / 100  # rounded down: never quite all
     return (
-        f"Without friction, simulations of the test recordings miss the measured motion by "
-        f"{shown[0]};\n{end}, {less:.{3 if less < 99.9 else 4}g} % less."
+        f"Without friction, simulations{lasting} of the test recordings miss the measured motion "
+        f"by {shown[0]};\n{end}, {less:.{3 if less < 99.9 else 4}g} % less."
     )
 
 

@@ -81,13 +81,15 @@ def verdict(comparison: Comparison) -> str:
 
 
 def _best(comparison: Comparison, best: str) -> str:
-    error = 1e3 * comparison.table()["all"][best]
+    over = comparison.judged_over()
+    error = 1e3 * comparison.table(over)["all"][best]
+    run = f"windows of {over} s, as the free run is chaotic," if over else "free run"
     end = "; no model is better" if best == NO_FRICTION else ""
     found = (
-        f"best on test recordings: {best} (free run over all joints: {error:.3g} "
+        f"best on test recordings: {best} ({run} over all joints: {error:.3g} "
         f"m{comparison.unit}){end}"
     )
-    tied, limit = comparison.indistinguishable(), comparison.limit()
+    tied, limit = comparison.indistinguishable(), comparison.limit(over)
     # Without a limit no difference can be called insignificant.
     if len(tied) < 2 or limit is None:
         return found

@@ -24,7 +24,7 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning, unlike_training
 from nfriction.fitting.options import DEFAULTS, checked_lengths
-from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.fit_result import UNIFORM_TURN, FitResult
 from nfriction.friction import both_names, model_name
 from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
-JUDGED_BY = "free-run RMSE over all joints and test recordings"
+JUDGED_BY = "{} RMSE over all joints and test recordings"
 SCHEMA = 4
 """Of `results.json`; the third had no `zero`, the second a `floor` from one encoder count in place
 of the `limit`, the first no number and `held_out` in place of `test`."""
@@ -193,20 +193,32 @@ class Comparison:
     def best(self) -> str | None:
         """The model that predicts the test recordings best, `"no friction"` included.
 
-        Judged by the free run over all joints and recordings; among models that are equal within a
-        thousandth, the one with the fewest parameters; if fits within the limit of it are good,
-        one of these. None if there is no test recording, or every free run diverged.
+        Judged by the error over all joints and recordings (`judged_over`); among models that are
+        equal within a thousandth, the one with the fewest parameters; if fits within the limit of
+        it are good, one of these. None if there is no test recording, or every run diverged.
         """
         if not self.test:
             return None
-        rmse = self.table()["all"]
+        over = self.judged_over()
+        rmse = self.table(over)["all"]
         if not np.isfinite(rmse.min()):
             return None
-        tied = rmse.min() + (self.limit() or 0.0)
+        tied = rmse.min() + (self.limit(over) or 0.0)
         good = [n for n, fit in self.fits.items() if fit.usability[0] == "good" and rmse[n] <= tied]
         if good and rmse.idxmin() != NO_FRICTION:
             rmse = rmse[good]
         return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
+
+    def judged_over(self) -> str | None:
+        """Length of the windows that decide which model is best; None for the free run.
+
+        If noise alone leaves an angle unknown at the end of a chaotic free run, models are judged
+        over the longest windows that can be predicted.
+        """
+        lengths = sorted(self.horizons("test"), key=float, reverse=True)
+        if self.unit != "rad" or (self.limit() or 0.0) < UNIFORM_TURN:
+            return None
+        return next((h for h in lengths if (self.limit(h) or math.inf) < UNIFORM_TURN), None)
 
     def limit(
         self,
@@ -254,7 +266,8 @@ class Comparison:
         best = self.best()
         if best is None:
             return ()
-        rmse, limit = self.table()["all"], self.limit()
+        over = self.judged_over()
+        rmse, limit = self.table(over)["all"], self.limit(over)
         near = () if limit is None else rmse.index[rmse <= rmse.min() + limit]
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
@@ -268,13 +281,14 @@ class Comparison:
         """
         if not self.test:
             return {}
-        rmse, limit = self.table()["all"], self.limit() or 0.0
+        over = self.judged_over()
+        rmse, limit = self.table(over)["all"], self.limit(over) or 0.0
         found, excused = {}, [NO_FRICTION]
         largest = rmse.get(NO_FRICTION, 0.0)
         for name, error in rmse.items():
             smaller = rmse[[self._parameters(n) <= self._parameters(str(name)) for n in rmse.index]]
             least = smaller.min()
-            if error <= (self.limit(model=str(name)) or 0.0) < largest:
+            if error <= (self.limit(over, model=str(name)) or 0.0) < largest:
                 excused.append(str(name))
             # Where all of these diverge, none is known to be better.
             elif np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
@@ -340,8 +354,10 @@ class Comparison:
                 models[name]["fit"] = fit.to_dict() | {"usability": list(self.rating(name))}
         best, judged = self.best(), None
         if best is not None:
+            over = self.judged_over()
+            by = JUDGED_BY.format(f"{over} s window" if over else "free-run")
             judged = {
-                "model": best, "by": JUDGED_BY, "limit": self.limit(),
+                "model": best, "by": by, "limit": self.limit(over),
                 "indistinguishable": list(self.indistinguishable()),
             }  # fmt: skip
         return {

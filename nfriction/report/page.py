@@ -193,7 +193,9 @@ def to_html(run: Run) -> str:
     comparison = run.comparison
     error = {}
     if run.best is not None:
-        error = (1e3 * comparison.table(part=comparison.parts[0])["all"]).to_dict()
+        part = comparison.parts[0]
+        over = comparison.judged_over() if part == "test" else None
+        error = (1e3 * comparison.table(over, part=part)["all"]).to_dict()
     info = next((info for _, info in run.models.values()), None)
     return document(
         "page.html.j2",

@@ -372,6 +372,34 @@ def test_models_within_the_limit_of_the_best_are_indistinguishable(comparison):
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
 
 
+def test_chaotic_motion_is_judged_over_windows_that_can_be_predicted(comparison):
+    found, _ = comparison
+
+    def chaotic(name: str, free: float, *windows: float) -> Score:
+        def rmse(*errors: float) -> dict[str, RMSE]:
+            return {h: RMSE((e, e), e) for h, e in zip(("0.5", "1"), errors, strict=True)}
+
+        limit = Errors(RMSE((9.0, 9.0), 9.0), rmse(0.05, 2.0))
+        return Score(
+            RMSE((free, free), free), rmse(*windows), limit,
+            "b", np.zeros(1), np.zeros((1, 2)), np.inf,
+        )  # fmt: skip
+
+    errors = {"no friction": (7.0, 3.0, 3.0), "NCFM": (8.0, 0.1, 5.0), "LFM": (6.5, 0.3, 1.0)}
+    judged = dataclasses.replace(found, test={n: [chaotic(n, *e)] for n, e in errors.items()})
+    assert judged.judged_over() == "0.5"
+    assert judged.best() == "NCFM"
+    assert judged.indistinguishable() == ("NCFM",)
+    assert judged.unfit() == {
+        "LFM": "NCFM, with no more parameters, errs by 100 mrad, this model by 300 mrad"
+    }
+    assert "best on test recordings: NCFM (windows of 0.5 s, as the free run is" in verdict(judged)
+    by = judged.to_dict()["best"]
+    assert by["by"] == "0.5 s window RMSE over all joints and test recordings"
+    assert by["limit"] == 0.05
+    assert scored(found, 0.7, no_friction=5.0, LFM=1.0).judged_over() is None
+
+
 def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     found, _ = comparison
     good = {n: dataclasses.replace(f, residual=0.0, converged=True) for n, f in found.fits.items()}
