@@ -61,6 +61,7 @@ class Mistake:
     text: str  # a clause such as "the sign of joint2's position is reversed"
     unexplained: float  # share of the torque after the correction [-]; NaN if none is known
     rig: Plant | None = None  # corrected in several terms at once
+    timed: bool = False  # a wrong sample rate would explain the same
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,9 @@ def likely_mistakes(
         if term.lower <= x <= term.upper:
             sound = min(share, sound)  # The fit corrects this by itself.
         else:
-            tested.append((f"{term.name} is {1 + x:.3g} times that of the rig", share))
+            cause = f"{term.name} is {1 + x:.3g} times that of the rig", share
+            # Without a drive, a guessed inertia is likelier than a missing rotor.
+            tested.insert(len(tested) if given.driven else 0, cause)
     # With different zeros, recordings of the same rig have different balances.
     unlike = []
     if len(recordings) > 1:
@@ -179,14 +182,23 @@ def likely_mistakes(
     several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
-    rare += [_wrong_rate(plant, given), *(each[:2] for each in several)]
+    rare += [_wrong_rate(plant, given), *((each.text, each.unexplained) for each in several)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
     explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
-    rigs = {text: rig for text, _, rig in several}
-    found = [Mistake(text, share, rigs.get(text)) for text, share in (*unlike, *explain)]
+    rigs = {mistake.text: mistake for mistake in several}
+    found = [rigs.get(text) or Mistake(text, share) for text, share in (*unlike, *explain)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
+        # A rig that is wrong in several terms hides a wrong convention.
+        both = [
+            Mistake(f"{text}, and {terms.text}", terms.unexplained)
+            for text, data in _corrected_positions(plant, convention, given)
+            for terms in _several_terms(plant, data, options)
+        ]
+        best = min(both, key=lambda mistake: mistake.unexplained, default=Mistake("", math.inf))
+        if noise < sound and best.unexplained < sound / options.diagnosis_ratio:
+            return stated, (best,)
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
     least = min((mistake.unexplained for mistake in found), default=0.0)
@@ -372,8 +384,8 @@ def _driven_without_torque(
         if rise.max() > options.energy_rise * float(kinetic.max()):
             text = (
                 f"{recording.name or 'a recording'} has no torque, but its motion gains energy up "
-                f"to {motion.time[rise.argmax()]:.3g} s; name the columns of the torque, or cut "
-                "off the part in which it is driven"
+                f"to {motion.time[rise.argmax()]:.3g} s; name the columns of the torque, cut off "
+                "the part in which it is driven, or correct masses, centres of mass and lengths"
             )
             yield Mistake(text, math.nan)
             return
@@ -704,12 +716,11 @@ def _scaled_terms(
                 yield term, x, adjusted_plant(plant, [term], given.q.new_tensor([x]))
 
 
-def _several_terms(
-    plant: Plant, given: _Data, options: FitOptions
-) -> Iterator[tuple[str, float, Plant]]:
-    """Inertia, gravity and length terms that together explain most, unless a fit reaches them.
+def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[Mistake]:
+    """Inertia, gravity and length terms that together explain most, unless within their bounds.
 
-    Masses and their centres are often guessed for a rig of one's own, all of them wrongly.
+    Masses and their centres are often guessed for a rig of one's own, all of them wrongly. Lengths
+    are not: together they scale as the square of the time, as for a film in slow motion.
     """
     terms = [
         term
@@ -732,7 +743,13 @@ def _several_terms(
         # A motion without torque determines only ratios.
         scale = "" if given.driven else ", for gravity 1 as given"
         text = f"several terms of the rig are wrong (times the given ones{scale}: {times})"
-        yield text, _unexplained(rig, given), rig
+        lengths = [1.0 + value for term, value in pairs if term.name.startswith("length")]
+        far = any(abs(value - 1.0) > options.length_term[0] for value in lengths)
+        timed = far and max(lengths) / min(lengths) - 1.0 < options.length_term[0]
+        if timed:
+            rate = math.sqrt(math.prod(lengths) ** (1 / len(lengths)))
+            text += f", or the true sample rate is {rate:.3g} times that in `time`"
+        yield Mistake(text, _unexplained(rig, given), rig, timed)
 
 
 def _corrected_torques(

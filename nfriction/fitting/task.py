@@ -121,11 +121,12 @@ def prepare_task(
         options=options, zeroed=per_recording, presliding=bool(model.law.memory),
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
-    corrected: tuple[str, ...] = ()
+    corrected, doubted = tuple[str, ...](), tuple[str, ...]()
     rig = mistakes[0].rig if mistakes else None
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
     if rig is not None and options.fit_plant and not inputs.largest_torques(joint).any():
         corrected, plant = (diagnosis.correction_note(stated, mistakes[0]),), rig
+        doubted = tuple(m.text for m in mistakes[:1] if m.timed)
         stated, mistakes = diagnosed(plant)
     named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
@@ -149,7 +150,8 @@ def prepare_task(
     measurement = inputs.measurement_matrix(plant, convention)
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
-        found, tuple(m.text for m in mistakes), tuple(drift), (*corrected, *unmodelled),
+        found, doubted + tuple(m.text for m in mistakes), tuple(drift),
+        corrected * (not doubted) + tuple(unmodelled),
         (inputs.SMOOTHED.format(floor, wanted),) * blurred,
     )  # fmt: skip
 

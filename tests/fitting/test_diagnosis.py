@@ -521,18 +521,22 @@ def test_mistakes_in_rigs_are_named(name, rig, finding):
 GUESSED = {"mass": [0.2, 0.2], "length": [0.2, 0.25]}
 
 
-def test_free_rig_with_guessed_masses_and_lengths_is_corrected():
+@pytest.mark.parametrize(("mass", "length"), [([0.2, 0.2], 0.2), ([0.5, 0.1], 0.3)])
+def test_free_rig_with_guessed_masses_and_lengths_is_corrected(mass, length):
     true, q, _ = measured("free")
-    guessed = PendulumChain(**GUESSED)
+    guessed = PendulumChain(mass=mass, length=[length, 0.25])
     recording = Recording(STEP * np.arange(SAMPLES), q, convention="relative,upright")
     found = fit("coulomb-viscous", guessed, recording)
     rating, reason = found.usability
     assert rating == "doubtful"
-    assert reason.startswith("several terms of the rig are wrong, see warnings")
-    (note,) = found.unmodelled
-    assert re.search(
-        r"as given: .*gravity 2 0\.52\d, length 1 1\.5.*The fit starts from the corrected rig", note
-    )
+    (note,) = (text for text in found.warnings if text.startswith("Several terms of the rig are"))
+    assert note.endswith("The fit starts from the corrected rig, see `FitResult.plant`.")
+    if length == 0.3:
+        assert reason.startswith("several terms of the rig are wrong, see warnings")
+        assert not found.mistakes
+    else:  # a length that is wrong by a half is no likelier than a wrong clock
+        assert "length 1 1.5), or the true sample rate is 1.23 times that in `time`. " in note
+        assert reason.startswith("a mistake in data or rig is likely: several terms of the rig")
     # A free swing determines ratios to the first gravity term.
     scale = guessed.gravity_moment[0] / true.gravity_moment[0]
     for name in ("gravity_moment", "inertia_coupling"):
@@ -541,6 +545,12 @@ def test_free_rig_with_guessed_masses_and_lengths_is_corrected():
     values = found.model.schedule.values / scale
     expected = torch.tensor([[0.02, 0.004], [0.008, 0.003]], dtype=torch.float64)
     torch.testing.assert_close(values, expected, rtol=0.1, atol=0.0)
+
+
+def test_guessed_free_rig_does_not_hide_a_wrong_convention():
+    _, q, _ = measured("free")
+    (warned, *_) = warnings_of(PendulumChain(**GUESSED), np.cumsum(q, axis=1), None)
+    assert "likely: angles are absolute, not relative (`convention`)" in warned
 
 
 def test_driven_rig_with_several_wrong_terms_is_named():

@@ -335,6 +335,10 @@ def adjustable_terms(
         drag=is_undriven_pendulum(plant, joint) if options.drag is None else options.drag,
         eccentricity=eccentric, options=options,
     )  # fmt: skip
+    if is_undriven_pendulum(plant, joint):
+        # Its masses and lengths are often guesses, and no drive can cause the same errors.
+        least, most = 1.0 / GUESSED - 1.0, GUESSED - 1.0
+        terms = [replace(t, lower=least, upper=most) if t.ratio else t for t in terms]
     repeated = {"angle_offset": per_recording, "gear_loss": law.reads_drive,
                 "torque_offset": "f_o" in law.names}  # fmt: skip
     return [t for t in terms if not any(repeated.get(name) for name in t.change)] + others
@@ -403,6 +407,8 @@ COARSE = (
     "Near rest a sample needs {} integration steps, fits take {}, so motion there is approximate; "
     "a higher sample rate avoids this, or a model with v_smooth >= {:.2g} (now {:.2g})."
 )
+# Largest factor between a guessed and the true inertia, gravity or length of a free rig.
+GUESSED = 10.0
 # Density of steel [kg/m^3].
 STEEL = 7_850.0
 # Bound of the error of angles after conversions.
