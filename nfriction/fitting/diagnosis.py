@@ -194,10 +194,11 @@ def likely_mistakes(
         both = [
             Mistake(f"{text}, and {terms.text}", terms.unexplained)
             for text, data in _corrected_positions(plant, convention, given)
+            if noise < sound and "`convention`" in text
             for terms in _several_terms(plant, data, options)
         ]
         best = min(both, key=lambda mistake: mistake.unexplained, default=Mistake("", math.inf))
-        if noise < sound and best.unexplained < sound / options.diagnosis_ratio:
+        if best.unexplained < sound / options.diagnosis_ratio:
             return stated, (best,)
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
