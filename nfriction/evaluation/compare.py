@@ -215,9 +215,9 @@ class Comparison:
         If noise alone leaves an angle unknown at the end of a chaotic free run, models are judged
         over the longest windows that can be predicted.
         """
-        lengths = sorted(self.horizons("test"), key=float, reverse=True)
         if self.unit != "rad" or (self.limit() or 0.0) < UNIFORM_TURN:
             return None
+        lengths = sorted(self.horizons("test"), key=float, reverse=True)
         return next((h for h in lengths if (self.limit(h) or math.inf) < UNIFORM_TURN), None)
 
     def limit(

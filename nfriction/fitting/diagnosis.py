@@ -211,21 +211,21 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     if not mistakes:
         return ()
     causes = ", or ".join(mistake.text for mistake in mistakes)
-    left = (
-        f" Friction leaves {stated:.2g} of the torque unexplained, after the correction "
-        f"{mistakes[0].unexplained:.2g}."
-    )
-    known = not math.isnan(mistakes[0].unexplained)
-    return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
+    return (f"A mistake in data or rig is likely: {causes}.{_shares(stated, mistakes[0])}",)
 
 
 def correction_note(stated: float, mistake: Mistake) -> str:
     """A mistake in the rig that a fit corrects, in a sentence."""
-    return (
-        f"{mistake.text[0].upper()}{mistake.text[1:]}. Friction leaves {stated:.2g} of the torque "
-        f"unexplained, after the correction {mistake.unexplained:.2g}. The fit starts from the "
-        "corrected rig, see `FitResult.plant`."
-    )
+    text = f"{mistake.text[0].upper()}{mistake.text[1:]}.{_shares(stated, mistake)}"
+    return f"{text} The fit starts from the corrected rig, see `FitResult.plant`."
+
+
+def _shares(stated: float, mistake: Mistake) -> str:
+    """A sentence on the torque unexplained before and after a correction; empty if unknown."""
+    if math.isnan(mistake.unexplained):
+        return ""
+    after = f"after the correction {mistake.unexplained:.2g}"
+    return f" Friction leaves {stated:.2g} of the torque unexplained, {after}."
 
 
 def unlike_training(

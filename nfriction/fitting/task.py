@@ -121,12 +121,12 @@ def prepare_task(
         options=options, zeroed=per_recording, presliding=bool(model.law.memory),
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
-    corrected, doubted = tuple[str, ...](), tuple[str, ...]()
-    rig = mistakes[0].rig if mistakes else None
+    first, corrected, doubted = next(iter(mistakes), None), tuple[str, ...](), tuple[str, ...]()
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
-    if rig is not None and options.fit_plant and not inputs.largest_torques(joint).any():
-        corrected, plant = (diagnosis.correction_note(stated, mistakes[0]),), rig
-        doubted = tuple(m.text for m in mistakes[:1] if m.timed)
+    free = options.fit_plant and not inputs.largest_torques(joint).any()
+    if free and first is not None and first.rig is not None:
+        corrected, plant = (diagnosis.correction_note(stated, first),), first.rig
+        doubted = (first.text,) if first.timed else ()
         stated, mistakes = diagnosed(plant)
     named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
@@ -151,7 +151,7 @@ def prepare_task(
     return FitTask(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, doubted + tuple(m.text for m in mistakes), tuple(drift),
-        corrected * (not doubted) + tuple(unmodelled),
+        (() if doubted else corrected) + tuple(unmodelled),
         (inputs.SMOOTHED.format(floor, wanted),) * blurred,
     )  # fmt: skip
 
