@@ -171,8 +171,8 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Options of `fit` and `compare`."""
     add = parser.add_argument
     add("--rig", required=True, type=rig,
-        help="a rig file (.json, .toml), a robot description (.urdf; MuJoCo's .xml or .mjcf), or "
-        f"one of {', '.join(RIGS)}")  # fmt: skip
+        help="a rig file (.json, .toml), a model file for its fitted rig, a robot description "
+        f"(.urdf; MuJoCo's .xml or .mjcf), or one of {', '.join(RIGS)}")  # fmt: skip
     add_reading_options(parser)
     add("--windows", type=positives, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"

@@ -6,9 +6,9 @@ shows which correction explains the motion. Each takes one pass of inverse dynam
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
 from typing import Any, NamedTuple
@@ -61,6 +61,7 @@ class Mistake:
     text: str  # a clause such as "the sign of joint2's position is reversed"
     unexplained: float  # share of the torque after the correction [-]; NaN if none is known
     rig: Plant | None = None  # corrected in several terms at once
+    ratios: Mapping[str, float] = field(default_factory=dict)  # of those terms to the given ones
     timed: bool = False  # a wrong sample rate would explain the same
 
 
@@ -145,7 +146,7 @@ def likely_mistakes(
         return math.nan, (broken,)
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
-    stated = sound = _unexplained(plant, given)
+    stated = _unexplained(plant, given)
     noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd_of_mean)
     # Inertias or torques wrong by the square of a thousand would have the same effect.
     if unit := time_unit(recordings[0].time):
@@ -153,9 +154,40 @@ def likely_mistakes(
         share = _unexplained(plant, given.at_rate(rate))
         if noise < stated and share < stated / options.diagnosis_ratio:
             return stated, (Mistake(f"time is in {short}", share),)
-    delay = 0.0, sound
     if stops := [*_end_stops(plant, recordings, given, options)]:
         return stated, tuple(stops)
+    # With different zeros, recordings of the same rig have different balances.
+    unlike = [*_unlike_zeros(plant, recordings, given, options)] if len(recordings) > 1 else []
+    found = [] if zeroed else [Mistake(*cause) for cause in unlike]
+    if noise < stated:
+        zeros = min((share for _, share in unlike), default=math.inf)
+        of = plant, recordings, motions, convention, given
+        found += _above_noise(*of, options, zeros, presliding)
+    if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
+        found = [*_driven_without_torque(plant, recordings, motions, options)]
+    # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
+    least = min((mistake.unexplained for mistake in found), default=math.nan)
+    sure = [m for m in found if not m.unexplained >= options.diagnosis_tie * least]
+    return stated, tuple(sure[:3])
+
+
+def _above_noise(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    convention: AngleConvention,
+    given: _Data,
+    options: FitOptions,
+    zeros: float,
+    presliding: bool,
+) -> list[Mistake]:
+    """Corrections that divide the unexplained torque by `diagnosis_ratio`, the simpler ones first.
+
+    `zeros` is the share that different encoder zeros of the recordings leave.
+    """
+    stated = sound = _unexplained(plant, given)
+    noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd_of_mean)
+    delay = 0.0, sound
     if given.tau.any():
         delay = balanced_delay(plant, recordings, motions, options)
         # A torque that is held until the next sample acts up to one step late.
@@ -170,40 +202,35 @@ def likely_mistakes(
             cause = f"{term.name} is {1 + x:.3g} times that of the rig", share
             # Without a drive, a guessed inertia is likelier than a missing rotor.
             tested.insert(len(tested) if given.driven else 0, cause)
-    # With different zeros, recordings of the same rig have different balances.
-    unlike = []
+    if sound <= noise:
+        return []
     if len(recordings) > 1:
-        unlike = [*_unlike_zeros(plant, recordings, given, options)]
-        most = min([sound, *(share for _, share in unlike)]) / options.diagnosis_ratio
+        most = min(sound, zeros) / options.diagnosis_ratio
         tested += _odd_one_out(plant, recordings, motions, convention, most, options)
-        unlike = [] if zeroed else unlike
-    # Simpler causes first: near one position a spring is like gravity, and a ratio like a unit.
+    # Near one position a spring is like gravity, and a ratio like a unit.
     least = min((share for _, share in tested), default=math.inf)
     several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
+    rare += _unlike_gains(plant, given, options) if len(given.driven) > 1 else ()
     rare += [_wrong_rate(plant, given), *((each.text, each.unexplained) for each in several)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
     tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
-    explain = [x for x in tested if noise < sound and x[1] < sound / options.diagnosis_ratio]
     rigs = {mistake.text: mistake for mistake in several}
-    found = [rigs.get(text) or Mistake(text, share) for text, share in (*unlike, *explain)]
+    most = sound / options.diagnosis_ratio
+    found = [rigs.get(text) or Mistake(text, share) for text, share in tested if share < most]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         # A rig that is wrong in several terms hides a wrong convention.
         both = [
             Mistake(f"{text}, and {terms.text}", terms.unexplained)
             for text, data in _corrected_positions(plant, convention, given)
-            if noise < sound and "`convention`" in text
+            if "`convention`" in text
             for terms in _several_terms(plant, data, options)
         ]
         best = min(both, key=lambda mistake: mistake.unexplained, default=Mistake("", math.inf))
-        if best.unexplained < sound / options.diagnosis_ratio:
-            return stated, (best,)
-        return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
-    # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
-    least = min((mistake.unexplained for mistake in found), default=0.0)
-    return stated, tuple(m for m in found if m.unexplained < options.diagnosis_tie * least)[:3]
+        found = [best] if best.unexplained < most else []
+    return found
 
 
 def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ...]:
@@ -217,7 +244,7 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
 def correction_note(stated: float, mistake: Mistake) -> str:
     """A mistake in the rig that a fit corrects, in a sentence."""
     text = f"{mistake.text[0].upper()}{mistake.text[1:]}.{_shares(stated, mistake)}"
-    return f"{text} The fit starts from the corrected rig, see `FitResult.plant`."
+    return f"{text} The fit starts from the corrected rig; its terms are relative to the given one."
 
 
 def _shares(stated: float, mistake: Mistake) -> str:
@@ -750,7 +777,8 @@ def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[
         if timed:
             rate = math.sqrt(math.prod(lengths) ** (1 / len(lengths)))
             text += f", or the true sample rate is {rate:.3g} times that in `time`"
-        yield Mistake(text, _unexplained(rig, given), rig, timed)
+        ratios = {term.name: 1.0 + value for term, value in pairs}
+        yield Mistake(text, _unexplained(rig, given), rig, ratios, timed)
 
 
 def _corrected_torques(
@@ -768,11 +796,7 @@ def _corrected_torques(
         without = replace(given, tau=given.tau - part)
         gain = float(_balance(without, without.tau - given.needed(plant), part)[1])
         if gain and abs(gain - 1) > options.gain_term[0]:
-            size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
-            # Three digits, but 1000 and not 1e+03.
-            times = f"{float(f'{abs(size):.3g}'):g} times too {way}"
-            wrong = "has the wrong sign and " * (gain < 0)
-            wrong += f"is {times} (a unit, torque constant or gear ratio)"
+            wrong = f"{_too_large(gain)} (a unit, torque constant or gear ratio)"
             cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
             yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
     needed = given.needed(plant)
@@ -784,6 +808,33 @@ def _corrected_torques(
             signed[:, j] = tau.abs() * torch.sign(needed[:, j])
             text = f"the {kind} of {plant.joint_names[j]} is recorded without its sign"
             yield text, replace(given, tau=signed)
+
+
+def _too_large(gain: float) -> str:
+    """The error of a torque that must be multiplied by a gain, in a clause."""
+    size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
+    # Three digits, but 1000 and not 1e+03.
+    wrong = f"is {float(f'{abs(size):.3g}'):g} times too {way}"
+    return "has the wrong sign and " * (gain < 0) + wrong
+
+
+def _unlike_gains(plant: Plant, given: _Data, options: FitOptions) -> Iterator[tuple[str, float]]:
+    """A gain for each drive, as torque constants of different motors may all be wrong."""
+    driven, needed = given.driven, given.needed(plant)
+    without = replace(given, tau=torch.zeros_like(given.tau))
+    _, gains = _balance(without, -needed, torch.diag_embed(given.tau)[..., driven])
+    wrong = [
+        f"that of {plant.joint_names[j]} {_too_large(gain)}"
+        for j, gain in zip(driven, gains.tolist(), strict=True)
+        if gain and abs(gain - 1) > options.gain_term[0]
+    ]
+    if len(wrong) > 1 and (gains != 0).all():
+        kind = "force" if plant.unit == "m" else "torque"
+        scaled = given.tau.clone()
+        scaled[:, driven] *= gains
+        text = f"the {kind}s are off by different factors: {' and '.join(wrong)}"
+        text += " (torque constants or gear ratios)"
+        yield text, _unexplained(plant, replace(given, tau=scaled))
 
 
 def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:

@@ -113,7 +113,7 @@ def fit(
         raise ValueError('adaptive and neuro-fuzzy models need `method="output_error"`.')
     # By name, so that a schedule outside the core can bring its own strategy.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
-    found = strategy(task)
+    found = strategy(task).with_terms_times(task.ratios)
     unmodelled = *task.drift, *task.unmodelled
     found = found.with_own_model().with_warnings(
         task.warnings_beside(found), task.mistakes, unmodelled

@@ -2,8 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,7 @@ class FitTask:
     """Checked arguments of a fit, as every strategy (`Schedule.fit_strategy`) takes them."""
 
     model: FrictionModel  # to fit; a strategy changes it once, at the end
-    plant: Plant  # the mechanism as given
+    plant: Plant  # the mechanism as given, or corrected in `ratios`
     recordings: Sequence[Recording]  # in joint coordinates
     measurement: Tensor  # matrix from joint to recorded coordinates, see `measurement_matrix`
     motions: tuple[Motion, ...]  # smoothed motion of each recording, in joint coordinates
@@ -47,6 +47,7 @@ class FitTask:
     drift: tuple[str, ...] = ()  # those of `data_warnings` on changes of friction
     unmodelled: tuple[str, ...] = ()  # those on other effects that no law describes
     smoothed: tuple[str, ...] = ()  # a warning of a wide smoothed sign
+    ratios: Mapping[str, float] = field(default_factory=dict)  # of terms of `plant` to those given
 
     def warnings_beside(self, found: FitResult) -> tuple[str, ...]:
         """Those about the data, and on a wide smoothed sign if the residual exceeds the noise."""
@@ -122,11 +123,13 @@ def prepare_task(
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
     first, corrected, doubted = next(iter(mistakes), None), tuple[str, ...](), tuple[str, ...]()
+    ratios: Mapping[str, float] = {}
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
     free = options.fit_plant and not inputs.largest_torques(joint).any()
     if free and first is not None and first.rig is not None:
         corrected, plant = (diagnosis.correction_note(stated, first),), first.rig
-        doubted = (first.text,) if first.timed else ()
+        doubted, ratios = (first.text,) if first.timed else (), first.ratios
+        start = start and start.with_terms_times({name: 1.0 / x for name, x in ratios.items()})
         stated, mistakes = diagnosed(plant)
     named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
@@ -152,7 +155,7 @@ def prepare_task(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, doubted + tuple(m.text for m in mistakes), tuple(drift),
         (() if doubted else corrected) + tuple(unmodelled),
-        (inputs.SMOOTHED.format(floor, wanted),) * blurred,
+        (inputs.SMOOTHED.format(floor, wanted),) * blurred, ratios,
     )  # fmt: skip
 
 

@@ -298,6 +298,8 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
 def read(path: str | Path) -> Plant:
     """Read a rig file: .json, .toml (Python 3.11 or newer), .urdf, or .xml (MJCF or URDF).
 
+    Of a model file, it is the rig as adjusted by the fit.
+
     Raises:
         ValueError: for another ending, a file that does not parse, or parameters that
             `from_dict` refuses; the message names the file.
@@ -311,7 +313,10 @@ def read(path: str | Path) -> Plant:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
             # Before it is read into memory.
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
-        return from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
+        content = _parse(path.read_bytes().decode(), path.suffix.lower())
+        # A model file contains the rig as its fit adjusted it.
+        described = isinstance(content, Mapping) and "rig" in content
+        return from_dict(content["rig"] if described else content)
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too

@@ -23,6 +23,7 @@ from nfriction import (
 from nfriction.fitting.fit import fit
 from nfriction.friction import model_by_name
 from nfriction.friction.memory import Gear
+from nfriction.io.model_file import load_plant
 from tests.cli.benches import QUICK
 
 
@@ -48,6 +49,10 @@ def test_next_command_printed_by_fit_works(
     output = capsys.readouterr().out
     model = load(fitted)
     assert isinstance(model, LFM)
+    # As a rig, a model file is that of the fit.
+    read, given = rigs.read(fitted), rigs.read(bench / "bench.json")
+    assert not torch.equal(read.inertia_coupling, given.inertia_coupling)
+    assert read.to_dict() == load_plant(fitted).to_dict()
     # Four digits are printed.
     assert values(output, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
     (command,) = (line for line in output.splitlines() if line.startswith("next: "))

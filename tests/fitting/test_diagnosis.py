@@ -466,6 +466,7 @@ def test_mistakes_in_positions_are_named(name, change, finding):
     [
         ("driven", lambda tau: -tau, "every torque has the wrong sign"),
         ("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
+        ("driven", lambda tau: tau * [3.0, 0.4], "different factors: that of joint1 is 3"),
         ("driven", lambda tau: tau[:, ::-1], "the torques of joint1 and joint2 are exchanged"),
         ("driven", lambda tau: later(tau, 10), "torques are recorded 18"),
         ("motor", lambda tau: tau / 0.12, "the torque of joint1 is 8.3"),
@@ -526,11 +527,11 @@ def test_free_rig_with_guessed_masses_and_lengths_is_corrected(mass, length):
     true, q, _ = measured("free")
     guessed = PendulumChain(mass=mass, length=[length, 0.25])
     recording = Recording(STEP * np.arange(SAMPLES), q, convention="relative,upright")
-    found = fit("coulomb-viscous", guessed, recording)
+    found = fit("coulomb-viscous", guessed, recording, windows=(0.5,))
     rating, reason = found.usability
     assert rating == "doubtful"
     (note,) = (text for text in found.warnings if text.startswith("Several terms of the rig are"))
-    assert note.endswith("The fit starts from the corrected rig, see `FitResult.plant`.")
+    assert note.endswith("from the corrected rig; its terms are relative to the given one.")
     if length == 0.3:
         assert reason.startswith("several terms of the rig are wrong, see warnings")
         assert not found.mistakes
@@ -542,6 +543,14 @@ def test_free_rig_with_guessed_masses_and_lengths_is_corrected(mass, length):
     for name in ("gravity_moment", "inertia_coupling"):
         values, expected = getattr(found.plant, name), scale * getattr(true, name)
         torch.testing.assert_close(values, expected, rtol=0.03, atol=0.0)
+    # Terms and intervals are relative to the rig as given, also of a fit that starts from another.
+    moment = found.plant.gravity_moment[1] / guessed.gravity_moment[1]
+    again = fit("coulomb-viscous", guessed, recording, windows=(0.5,), start=found)
+    for result in (found, again):
+        (term,) = (x for name, x, _ in result.plant_terms if name == "gravity 2")
+        assert 1 + term == pytest.approx(float(moment), rel=1e-4)
+        (interval,) = (i for i in result.intervals if i.name == "gravity 2")
+        assert interval.low < interval.value == term < interval.high
     values = found.model.schedule.values / scale
     expected = torch.tensor([[0.02, 0.004], [0.008, 0.003]], dtype=torch.float64)
     torch.testing.assert_close(values, expected, rtol=0.1, atol=0.0)
@@ -898,7 +907,7 @@ def test_a_recording_of_another_rig_is_named(zero):
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
 
 
-@pytest.mark.parametrize("factor", [3.0, 0.3])
+@pytest.mark.parametrize("factor", [3.0, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_friction_change_between_recordings_is_not_another_rig(factor):
     plant = measured("motor")[0]
     recordings = of_several_days(plant, [0.3 * factor, 0.12 * factor])
@@ -946,7 +955,9 @@ def test_recordings_zeroed_in_different_poses_are_of_one_rig():
     assert re.search("zeros differ: .* 1.7 degrees .* 2.9 degrees .*per_rec", shared.mistakes[0])
 
 
-@pytest.mark.parametrize("degrees", [(3.0, 0.0), (0.0, 3.0), (0.0, 0.0)])
+@pytest.mark.parametrize(
+    "degrees", [pytest.param((3.0, 0.0), marks=pytest.mark.slow), (0.0, 3.0), (0.0, 0.0)]
+)
 def test_encoder_homed_again_is_named(degrees):
     """Also if friction dominates the torque, so that the correction explains less than half."""
     plant = PendulumChain(**DOUBLE)
@@ -1152,7 +1163,9 @@ def test_torque_noise_is_no_error_of_the_law():
     assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
 
 
-@pytest.mark.parametrize(("factor", "verdict"), [(0.15, "good"), (0.3, "doubtful")])
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [pytest.param(0.15, "good", marks=pytest.mark.slow), (0.3, "doubtful")]
+)
 def test_small_error_is_not_doubtful_with_a_fine_encoder(factor, verdict):
     """An error of the law is judged relative to the motion, however fine the encoder is."""
     plant, fine, tau = measured("wheel", COUNT / 1024)
@@ -1244,7 +1257,7 @@ def test_undriven_rig_that_disagrees_with_its_motion_is_named(inertia, verdict):
 
 
 @pytest.mark.parametrize(("scale", "verdict"), [(0.95, None), (0.85, "good"), (0.72, "doubtful")])
-@pytest.mark.parametrize("name", ["wheel", "axis"])
+@pytest.mark.parametrize("name", [pytest.param("wheel", marks=pytest.mark.slow), "axis"])
 def test_torque_scale_of_a_single_inertia_is_named(name, scale, verdict):
     plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, unit=plant.unit)
@@ -1268,7 +1281,7 @@ def test_fit_that_determines_no_friction_is_unusable():
 
 
 @pytest.mark.parametrize("method", ["equation_error", "output_error"])
-@pytest.mark.parametrize("weight", [5.0, -98.0])
+@pytest.mark.parametrize("weight", [5.0, pytest.param(-98.0, marks=pytest.mark.slow)])
 def test_weight_missing_in_the_rig_does_not_bias_friction(method, weight):
     plant, q, tau = measured("axis")
     level = Recording(STEP * np.arange(len(q)), q, tau, unit="m")
@@ -1288,7 +1301,7 @@ def test_weight_missing_in_the_rig_does_not_bias_friction(method, weight):
         assert "but not if it is a sensor's bias" in warning
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_offset_does_not_replace_friction_in_one_direction(seed):
     """Nor for a joint at rest."""
     plant = Rotor(**WHEEL)

@@ -4,7 +4,7 @@ import copy
 import html
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
@@ -151,6 +151,23 @@ class FitResult:
         """The same with a copy of the model, as another fit may change the given one."""
         model, uncertainty = copy.deepcopy((self.model, self.uncertainty))
         return replace(self, model=model, uncertainty=uncertainty)
+
+    def with_terms_times(self, ratios: Mapping[str, float]) -> "FitResult":
+        """The same with relative terms of the plant stated for another rig, by name.
+
+        The plant stays; each `ratio` is that of the present reference to the new one.
+        """
+
+        def changed(name: str, value: float) -> float:
+            return (1.0 + value) * ratios[name] - 1.0 if name in ratios else value
+
+        terms = tuple((name, changed(name, x), changed(name, b)) for name, x, b in self.plant_terms)
+        intervals = tuple(
+            replace(i, value=value, low=low, high=high)
+            for i in self.intervals
+            for value, low, high in [[changed(i.name, x) for x in (i.value, i.low, i.high)]]
+        )
+        return replace(self, plant_terms=terms, intervals=intervals)
 
     def without(self, warnings: Sequence[str]) -> "FitResult":
         """The same without these warnings."""
