@@ -196,6 +196,7 @@ def other(comparison: Comparison) -> Comparison:
     return dataclasses.replace(comparison, fits={"good": comparison.fits["good"]}, train=train)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that share what was fitted")
 @pytest.mark.usefixtures("quick_scripts")
 def test_a_kill_at_any_moment_never_mixes_two_runs(

@@ -142,7 +142,7 @@ def test_half_a_sample_of_delay_is_reported():
     # The last case needs more integration steps at the start of the search than at its end.
     [
         ((3, 0.1, 0.003), "doubtful"),
-        ((1, 0.1, 0.003), "good"),
+        pytest.param((1, 0.1, 0.003), "good", marks=pytest.mark.slow),
         pytest.param((0, 0.45, 0.05), "doubtful", marks=pytest.mark.slow),
     ],
 )

@@ -154,7 +154,8 @@ def test_dry_and_viscous_friction_have_separate_direction_ratios() -> None:
     assert not chosen_inputs(strict, law)[0]
 
 
-@pytest.mark.parametrize("cooling_time", [COOLING, pytest.param(60.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cooling_time", [COOLING, 60.0])
+@pytest.mark.slow
 def test_heat_dependence_is_recovered(cooling_time) -> None:
     """Although it cools faster than a long window lasts, or more slowly than a recording."""
     brief, true = {**BRIEF, "windows": (0.5, 3.0)}, truth("heat")
@@ -198,7 +199,7 @@ def test_input_must_be_nonzero_at_some_joint(name, intervals, expected):
     assert significant(found, name) == expected
 
 
-@pytest.mark.parametrize("where", [set(), {0}])
+@pytest.mark.parametrize("where", [pytest.param(set(), marks=pytest.mark.slow), {0}])
 def test_heat_and_position_are_described_only_where_they_are_significant(where, monkeypatch):
     monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
     monkeypatch.setattr(neurofuzzy.inputs, "significant", lambda found, name: where)

@@ -94,7 +94,8 @@ def stuck_half_the_time(seed: int, friction: dict[str, float]) -> Recording:
     return Recording(time, quantise(np.array(angle)[:, None], 16384), tau=torque[:, None])
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3])
 def test_intervals_include_the_step_size_limit_of_the_sign(seed):
     true = {"F_c": 0.35, "F_d": 0.2, "F_v": 0.12, "v_s": 0.2}
     settings = {"windows": (0.5,), "fit_plant": False, "encoder_reference": "shared"}
