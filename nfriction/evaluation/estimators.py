@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nfriction.evaluation.compare import score_fit
 from nfriction.evaluation.lead_in import ZERO_IN, longest_window
@@ -21,7 +21,7 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
-from nfriction.recording import Recording, RecordingLike
+from nfriction.recording import Array, Recording, RecordingLike
 from nfriction.signals import kalman_smoother
 
 try:
@@ -38,7 +38,6 @@ except ImportError:
             )
 
 
-Array = NDArray[np.float64]
 # Settings of `fit` that do not belong to a single call.
 SETTINGS = {
     name: parameter

@@ -22,14 +22,12 @@ from nfriction.friction.memory import deflections, holding_share, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
-from nfriction.recording import Recording
+from nfriction.recording import Array, Recording
 from nfriction.signals import causal_motion, count_seen
 from nfriction.simulation.rollout import Scheme, rollout
 from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 LEAD_IN = 0.2
 """Length of the lead-in [s].

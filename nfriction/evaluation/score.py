@@ -13,17 +13,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN, Runs, Simulator, with_own_zero
 from nfriction.fitting.data.inputs import release
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
-from nfriction.recording import Recording, RecordingLike
+from nfriction.recording import Array, Recording, RecordingLike
 from nfriction.simulation.rollout import Scheme
 
-Array = NDArray[np.float64]
 HORIZONS = (1.0, 2.0, 5.0)
 
 

@@ -15,19 +15,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from nfriction.evaluation.parallel import Progress, as_completed, check_jobs
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import Usability
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
-from nfriction.recording import RecordingLike
+from nfriction.recording import Array, RecordingLike
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
 Session: TypeAlias = RecordingLike | Sequence[RecordingLike]
 
 

@@ -7,18 +7,16 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nfriction.plant.chain import PendulumChain
 from nfriction.plant.reduction import (
     LARGEST_NUMBER,
     LONGEST_NAME,
+    Array,
     HingedLink,
     RigidBody,
     pendulum_chain,
 )
-
-Array = NDArray[np.float64]
 
 ENDINGS = (".urdf", ".xml", ".mjcf")
 LARGEST_FILE = 64 * 2**20

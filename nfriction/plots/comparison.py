@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
@@ -22,9 +21,7 @@ from nfriction.friction import both_names
 from nfriction.plots import neurofuzzy, style
 from nfriction.plots.drawing import mechanism
 from nfriction.plots.friction_torque import torque_over_velocity
-from nfriction.recording import Recording
-
-Array = NDArray[np.float64]
+from nfriction.recording import Array, Recording
 
 # Width that a bar and its number need next to others [in].
 _BAR = 0.13

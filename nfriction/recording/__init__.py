@@ -7,10 +7,11 @@ from nfriction.recording.record import (
     Unit,
     read_initial_states,
 )
-from nfriction.recording.validation import MINIMUM_SAMPLES, is_uniform
+from nfriction.recording.validation import MINIMUM_SAMPLES, Array, is_uniform
 
 __all__ = [
     "MINIMUM_SAMPLES",
+    "Array",
     "Recording",
     "RecordingLike",
     "RecordingWarning",

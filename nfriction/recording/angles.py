@@ -14,9 +14,10 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from nfriction.recording.validation import Array
+
 Angles = Literal["relative", "absolute"]
 MeasuredFrom = Literal["upright", "hanging"]
 _WORDS = {*get_args(Angles), *get_args(MeasuredFrom)}

@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from nfriction.io import formats
 from nfriction.io.files import shortened
 from nfriction.recording.angles import AngleConvention, ConventionLike, Mechanism
-from nfriction.recording.validation import check, doubts, gaps, is_uniform, read_only
+from nfriction.recording.validation import Array, check, doubts, gaps, is_uniform, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 Unit = Literal["rad", "m"]
 
 

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from nfriction.io import formats
 from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, slides, to_si
 from nfriction.recording.record import Unit
-from nfriction.recording.validation import turns_between_samples
+from nfriction.recording.validation import Array, turns_between_samples
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 # Other names of our columns, optionally followed by the joint's number.
 _NAMES = {
@@ -208,7 +206,15 @@ class TorqueTable:
             raise ValueError(f'`unit` must be "rad" or "m", got {unit!r}.')
         table = table.set_axis([str(name) for name in table.columns], axis=1)
         sources = _sources(table, columns or {})
-        _require_unit(unit, sources)
+        for (kind, _), (column, written) in sources.items():
+            if kind in ("q", "qd") and written and is_unit(written):
+                written = canonical_unit(written)
+                true = "m" if slides(written.removesuffix("/s")) else "rad"
+                if true != unit:
+                    raise ValueError(
+                        f"`unit` is {unit!r}, but column {column} is in {written}; read the table "
+                        f"with `unit={true!r}` (`--unit {true}`)."
+                    )
         values = {
             key: _numbers(table, key[0], *source, degrees=degrees)
             for key, source in sources.items()
@@ -289,18 +295,6 @@ def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tupl
         own = aliases.get(source.column, source.column)
         found[key] = (own, source.unit or units.get(own))
     return found
-
-
-def _require_unit(unit: Unit, sources: Mapping[_Key, tuple[str, str | None]]) -> None:
-    """Raise ValueError if a column's own unit contradicts the unit of positions."""
-    for (key, _), (column, own) in sources.items():
-        if key in ("q", "qd") and own and is_unit(own):
-            found = "m" if slides(canonical_unit(own).removesuffix("/s")) else "rad"
-            if found != unit:
-                raise ValueError(
-                    f"`unit` is {unit!r}, but column {column} is in {canonical_unit(own)}; read "
-                    f"the table with `unit={found!r}` (`--unit {found}`)."
-                )
 
 
 def _key(name: str) -> _Key | None:

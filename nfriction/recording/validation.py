@@ -88,28 +88,25 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
             f"take a longer file or window."
         )
     for key, values in arrays.items():
-        if values is not None:
-            _check_values(key, values)
+        if values is None:
+            continue
+        # The negation also catches NaN.
+        bad = np.argwhere(~(np.abs(values) <= LARGEST_VALUE))
+        if len(bad):
+            sample, *joint = bad[0]
+            label = key + "".join(str(j + 1) for j in joint)
+            value = values[tuple(bad[0])]
+            rule = f"within {LARGEST_VALUE:g}" if np.isfinite(value) else "finite"
+            raise ValueError(
+                f"`{label}` must be {rule}, got {value} at sample {sample} ({len(bad)} in all); "
+                "drop such rows with their times, since samples may be missing."
+            )
     _check_stamps(time)
     # No encoder has steps of a radian.
     if unit == "rad" and np.ptp(q) > 1 and (q == np.rint(q)).all():
         raise ValueError(
             f"`q` must be in radians, got only whole numbers, from {q.min():g} to {q.max():g}; "
             "state the unit: counts per turn with the column, as in q1=q1:counts/8192, or degrees."
-        )
-
-
-def _check_values(key: str, values: Array) -> None:
-    # The negation also catches NaN.
-    bad = np.argwhere(~(np.abs(values) <= LARGEST_VALUE))
-    if len(bad):
-        sample, *joint = bad[0]
-        label = key + "".join(str(j + 1) for j in joint)
-        value = values[tuple(bad[0])]
-        rule = f"within {LARGEST_VALUE:g}" if np.isfinite(value) else "finite"
-        raise ValueError(
-            f"`{label}` must be {rule}, got {value} at sample {sample} "
-            f"({len(bad)} in all); drop such rows with their times, since samples may be missing."
         )
 
 

@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from nfriction.signals.kalman import Motion, check_motion
-
-Array = NDArray[np.float64]
+from nfriction.signals.kalman import Array, Motion, check_motion
 
 # Smallest share of one-count changes among all changes of a moving joint.
 REPEATED = 0.01

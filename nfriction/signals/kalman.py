@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from nfriction.recording import is_uniform
-
-Array = NDArray[np.float64]
+from nfriction.recording import Array, is_uniform
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -171,7 +169,12 @@ def _most_likely(
     misfit = misfit.reshape(len(BANDWIDTHS), -1, q.shape[1]).sum(axis=1)
     volume = volume * (len(first) / delta.shape[1])
     count = (length - 1) * len(first)
-    floor = _resolution(q) ** 2 / 12
+    # The smallest change of a position between two samples, at least round-off, is its resolution.
+    change = np.abs(np.diff(q, axis=0))
+    smallest = np.where(change > 0, change, np.inf).min(axis=0)
+    rounding = np.finfo(np.float64).eps * np.maximum(np.abs(q).max(axis=0), 1.0)
+    resolution = np.where(np.isfinite(smallest), np.maximum(smallest, rounding), rounding)
+    floor = resolution**2 / 12
     if sigma is not None:
         variance = np.broadcast_to(sigma**2, misfit.shape)
     elif density is not None:
@@ -228,14 +231,6 @@ def _lowest(cost: Array) -> Array:
     bend = below - 2 * here + above
     shift = 0.5 * (below - above) / np.where(bend > 0, bend, np.inf)
     return np.where(row == inner, inner + shift, row)
-
-
-def _resolution(q: Array) -> Array:
-    """Smallest change of every joint's position between two samples, at least round-off."""
-    change = np.abs(np.diff(q, axis=0))
-    smallest = np.where(change > 0, change, np.inf).min(axis=0)
-    rounding = np.finfo(np.float64).eps * np.maximum(np.abs(q).max(axis=0), 1.0)
-    return np.where(np.isfinite(smallest), np.maximum(smallest, rounding), rounding)
 
 
 def _model(delta: Array, process: Array) -> tuple[Array, Array]:

@@ -9,14 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nfriction.io.formats.numbers import THOUSANDS, column_numbers
+from nfriction.io.formats.numbers import THOUSANDS, Array, column_numbers
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 OURS = re.compile(r"time|(q|qd|tau|motor|current)[1-9]\d{0,3}", re.ASCII)
 # What a motor's angle and current are converted to.

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive, peak_envelope
-from nfriction.recording import Recording
+from nfriction.recording import Array, Recording
 from nfriction.signals import Motion
 
-Array = NDArray[np.float64]
 # By recording and joint: (class, start [s], end [s]).
 Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
 

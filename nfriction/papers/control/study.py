@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.codegen import CompiledFunction
@@ -44,13 +43,12 @@ from nfriction.papers.twin.dataset import COUNTS, SPECIFICATIONS
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plant.chain import Arm
 from nfriction.plots import style
-from nfriction.recording import Recording
+from nfriction.recording import Array, Recording
 from nfriction.recording.angles import AngleConvention
 from nfriction.simulation.closed_loop import ControlledMotion, Electronics, control
 from nfriction.simulation.rollout import rollout
 
 logger = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 MODELS = ("NCFM", "LFM", "NLFM", "Stribeck", "ALFM", "NFLFM")
 """One or more of each class: constant, adaptive, neuro-fuzzy."""

@@ -22,11 +22,10 @@ from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.papers.control import study
 from nfriction.papers.twin.dataset import Split, read
 from nfriction.plant import Plant
-from nfriction.recording import Recording
+from nfriction.recording import Array, Recording
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.version import __version__
 
-Array = NDArray[np.float64]
 Callback = Callable[..., None]
 
 
