@@ -1,7 +1,5 @@
 """Data sets of simulated rigs by name: built on first use, then read from the cache."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

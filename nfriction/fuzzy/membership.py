@@ -4,8 +4,6 @@ The functions work elementwise on tensors that broadcast, keep dtype and device,
 scripted. Functions named `log_...` stay finite where the membership itself underflows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

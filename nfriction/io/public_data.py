@@ -4,8 +4,6 @@ The commit in a web address fixes the content of an original. The SHA-256 of a c
 that of the table from which the documentation's results were computed.
 """
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import http.client

@@ -1,7 +1,5 @@
 """Evidence for the prior precisions of groups of parameters, and MacKay's update of them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

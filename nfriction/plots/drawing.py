@@ -1,7 +1,5 @@
 """The mechanism, drawn from its plant, and its motion as a GIF."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

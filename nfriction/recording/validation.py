@@ -1,7 +1,5 @@
 """Requirements on recorded arrays, and signs that their units or time stamps are wrong."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Encoders and causal motion, as in a controller: counts, edges, and a low-pass filter."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

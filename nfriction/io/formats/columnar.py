@@ -1,7 +1,5 @@
 """Parquet and NPZ: tables stored column by column."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -5,8 +5,6 @@ decimal sign is the one with which all columns are numbers, the other sign separ
 single `0,5` or `1.234.567` decides for the whole file. A line `# decimal: ,` states it.
 """
 
-from __future__ import annotations
-
 import csv
 import gzip
 import io

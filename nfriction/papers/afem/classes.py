@@ -1,7 +1,5 @@
 """Classes of acceleration found in recordings: low, medium, high, joint by joint."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -9,8 +9,6 @@ bushing at the last link, linear feedback on encoder counts cannot hold the link
 is not in any of the fitted model classes.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Mapping, Sequence

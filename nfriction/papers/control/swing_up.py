@@ -1,7 +1,5 @@
 """Swing-up of links using only the arm: a torque over time, found by multiple shooting."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

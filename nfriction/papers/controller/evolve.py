@@ -4,8 +4,6 @@ Differential evolution (SciPy) varies the universes of inputs and outputs and th
 rule gives, and omits rules. The paper names evolutionary algorithms as its future work.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Import of Mamdani controllers from MATLAB's `.fis` text files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

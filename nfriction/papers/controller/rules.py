@@ -30,8 +30,6 @@ order. Instead of `table`, `rules` may list rules one by one for any number of i
 `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

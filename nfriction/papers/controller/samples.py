@@ -1,7 +1,5 @@
 """Samples of fuzzy controllers along a measured motion, as used to train the papers' network."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -9,8 +9,6 @@ cover all outputs; this is about five times faster (52 parameters, 40,000 sample
 60). A `LinearOutputModule` provides these columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 

@@ -11,8 +11,6 @@ bounded by a margin around the trained ones, the covariance P by its initial tra
 torque by what coefficients within these bounds can give, so that an outlier moves little.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

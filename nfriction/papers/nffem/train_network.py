@@ -4,8 +4,6 @@ The papers' last step: a rule-table controller is sampled over its universes, an
 its outputs without a validation set. Groups (joints) are trained one after another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Checks using the twins: independent frictionless simulations, and the true friction torque."""
 
-from __future__ import annotations
-
 import importlib.util
 from typing import Any
 

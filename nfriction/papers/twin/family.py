@@ -15,8 +15,6 @@ Mechanics, friction and integrator are independent of the library. No law or inp
 may be built from these formulas: the family is for testing, with model classes of its own.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
