@@ -123,13 +123,12 @@ def prepare_task(
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
     first, corrected, doubted = next(iter(mistakes), None), tuple[str, ...](), tuple[str, ...]()
-    ratios: Mapping[str, float] = {}
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
     free = options.fit_plant and not inputs.largest_torques(joint).any()
     if free and first is not None and first.rig is not None:
         corrected, plant = (diagnosis.correction_note(stated, first),), first.rig
-        doubted, ratios = (first.text,) if first.timed else (), first.ratios
-        start = start and start.with_terms_times({name: 1.0 / x for name, x in ratios.items()})
+        doubted = (first.text,) if first.timed else ()
+        start = start and start.with_terms_times({n: 1.0 / x for n, x in first.ratios.items()})
         stated, mistakes = diagnosed(plant)
     named = diagnosis.mistake_warning(stated, mistakes) + corrected
     for sentence in named:
@@ -155,7 +154,8 @@ def prepare_task(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, doubted + tuple(m.text for m in mistakes), tuple(drift),
         (() if doubted else corrected) + tuple(unmodelled),
-        (inputs.SMOOTHED.format(floor, wanted),) * blurred, ratios,
+        (inputs.SMOOTHED.format(floor, wanted),) * blurred,
+        first.ratios if first is not None and corrected else {},
     )  # fmt: skip
 
 

@@ -315,8 +315,9 @@ def read(path: str | Path) -> Plant:
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
         content = _parse(path.read_bytes().decode(), path.suffix.lower())
         # A model file contains the rig as its fit adjusted it.
-        described = isinstance(content, Mapping) and "rig" in content
-        return from_dict(content["rig"] if described else content)
+        if isinstance(content, Mapping) and content.get("rig", content) is None:
+            raise ValueError("this model file contains no rig; give a rig file.")
+        return from_dict(content.get("rig", content) if isinstance(content, Mapping) else content)
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too
