@@ -286,6 +286,45 @@ def test_offset_and_direction_dependent_friction_are_reported(rows: int, timed: 
     assert "lower in the negative direction than in the positive" in remark
 
 
+def test_direction_is_not_split_into_joints_for_a_law_with_memory() -> None:
+    """Rows of one direction alone lack the motion that a law with memory remembers."""
+    time, qd = motion(600, 1)
+    tau = qd * np.where(qd > 0, 1.0, 0.7) + 0.02 * np.random.default_rng(1).normal(size=600)
+    table = pd.DataFrame({"time": time, "qd": qd, "tau": tau})
+    (remark,) = fit_torque(table, "slip").table.remarks
+    assert "lower in the negative direction" in remark
+    assert "neuro-fuzzy:slip follows the direction" in remark
+    assert "separate joint" not in remark
+
+
+def test_law_no_better_than_the_mean_torque_is_reported() -> None:
+    """A robot's whole torque, in which gravity hides the friction."""
+    time, qd = motion(1000, 1)
+    q = np.cumsum(qd) * (time[1] - time[0])
+    noise = 0.3 * np.random.default_rng(0).normal(size=1000)
+    table = pd.DataFrame({"time": time, "qd": qd, "tau": np.tanh(qd / 3e-3) + 0.5 * qd + noise})
+    assert not fit_torque(table, "coulomb-viscous").table.remarks
+    whole = table.assign(tau=table.tau + 60 * np.sin(q))
+    remarks = fit_torque(whole, "coulomb-viscous").table.remarks
+    assert any("blocks of joint1 no better than the mean torque" in r for r in remarks)
+    # In one direction, dry friction is the mean torque.
+    one_way = table.assign(qd=2 + 0.1 * qd, tau=1 + noise)
+    remarks = fit_torque(one_way, "coulomb").table.remarks
+    assert not any("mean torque" in r for r in remarks)
+
+
+def test_single_mistakes_along_a_motion_are_reported() -> None:
+    table = stribeck_table()
+    table.loc[[100, 900], "tau"] = 300.0
+    remarks = fit_torque(table, "coulomb-viscous").table.remarks
+    assert any(r.startswith("Torques far off coulomb-viscous at joint1: 300 at ") for r in remarks)
+    # A torque that is far off for several rows is no single mistake.
+    burst = stribeck_table()
+    burst.loc[500:540, "tau"] *= 30.0
+    remarks = fit_torque(burst, "coulomb-viscous").table.remarks
+    assert not any("far off" in r for r in remarks)
+
+
 def test_sound_tables_raise_no_warning() -> None:
     for seed in range(40):
         for table in (speeds(1, seed=seed).drop(columns="time"), speeds(10, seed=seed)):
