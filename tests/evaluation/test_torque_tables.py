@@ -65,6 +65,33 @@ def test_known_coefficients_are_recovered_within_their_intervals() -> None:
     assert errors["Stribeck"] < errors["CVFM"] < errors["NCFM"]
 
 
+@pytest.mark.parametrize("scale", [1e-2, 1e-4])
+def test_slow_axis_has_the_friction_of_a_fast_joint(scale: float) -> None:
+    """Start values and bounds in rad/s would give an axis in m neither a peak nor a bend."""
+    time, qd = motion(800, 0)
+    noise = 0.03 * np.random.default_rng(0).normal(size=800)
+    peak = np.tanh(qd / 1e-2) * (1 + 0.8 * np.exp(-((qd / 0.3) ** 2))) + 0.2 * qd + noise
+    bend = 0.5 * np.tanh(qd / 1e-2) + 0.3 * qd + 0.6 * np.arctan(5 * qd) + noise
+    for tau, law, name, true in ((peak, "stribeck", "v_s", 0.3), (bend, "arctan", "f_b", 5.0)):
+        table = pd.DataFrame({"time": time, "qd": scale * qd, "tau": tau})
+        found = fit_torque(table, law, unit="m")
+        factor = scale if name == "v_s" else 1 / scale
+        row = found.intervals().loc[f"{name} of joint1"]
+        assert abs(row["value"] / factor - true) < 0.15 * true
+        assert row["low"] < row["value"] < row["high"] < 2 * true * factor
+        assert float(found.to_frame().loc["joint1"].iloc[0]) < 0.1
+
+
+def test_interval_of_a_slow_bristle_contains_its_estimate() -> None:
+    time = 0.02 * np.arange(300)
+    qd = 1e-4 * (np.sin(time) + 0.5 * np.sin(2.7 * time))
+    tau = np.tanh(qd / 1e-6) * (1 + 0.5 * np.exp(-((qd / 5e-5) ** 2)))
+    tau += 0.02 * np.random.default_rng(0).normal(size=300)
+    found = fit_torque(pd.DataFrame({"time": time, "qd": qd, "tau": tau}), "lugre", unit="m")
+    row = found.intervals().loc["v_s of joint1"]
+    assert row["low"] < row["value"] < row["high"]
+
+
 def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
     """White-noise intervals would cover only about half here: the correlation time is 20 rows."""
     rng, inside, wide = np.random.default_rng(5), 0, 0.0
