@@ -336,6 +336,15 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join([*remarks, *failed.values()]))
+    normal = [plain_name(n) for n, of in fits.items()
+              if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
+    for one in given.joints:
+        if normal and one.load is not None and float(one.load.min()) < 0.0:
+            remarks.append(
+                f"The load of {one.name} is negative in {int((one.load < 0).sum())} rows, but "
+                f"{' and '.join(normal)} take it for a normal force; give its magnitude. Only gear "
+                "needs its sign."
+            )
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):
         shown = _shown(given.joints[k], of)

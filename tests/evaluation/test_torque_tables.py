@@ -352,6 +352,18 @@ def test_single_mistakes_along_a_motion_are_reported() -> None:
     assert not any("far off" in r for r in remarks)
 
 
+def test_load_with_a_sign_is_reported_for_laws_of_its_magnitude() -> None:
+    table = stribeck_table(400)
+    load = 3.0 * np.sin(1.7 * table.time)
+    table = table.assign(tau=table.tau * np.abs(load))
+    (remark,) = fit_torque(table.assign(load=load), "coulomb,load-coulomb").table.remarks
+    assert remark.startswith("The load of joint1 is negative in ")
+    assert "load-coulomb take it for a normal force; give its magnitude" in remark
+    for given, models in ((np.abs(load), "load-coulomb"), (load, "coulomb")):
+        remarks = fit_torque(table.assign(load=given), models).table.remarks
+        assert not any("normal force" in r for r in remarks)
+
+
 def test_sound_tables_raise_no_warning() -> None:
     for seed in range(40):
         for table in (speeds(1, seed=seed).drop(columns="time"), speeds(10, seed=seed)):
