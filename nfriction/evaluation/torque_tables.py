@@ -603,7 +603,8 @@ def _fit(
     shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
-        rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
+        # What holds a joint at rest depends on the motion before, which these laws do not know.
+        rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test)).moving
         left = joint.rows(test)
         constant = torque_table.fit_joint(name, rest, v_smooth, options)
         for i, share in enumerate(shares):
@@ -612,9 +613,11 @@ def _fit(
             errors[i, k] = float(error.square().mean().sqrt())
     # Mean squares, so that blocks of equal length count as one table would.
     best = int(np.square(errors).mean(1).argmin())
-    found = torque_table.fit_joint(name, joint, v_smooth, options)
+    found = torque_table.fit_joint(name, joint.moving, v_smooth, options)
     if shares[best]:
-        found = torque_table.fit_network(found, joint, shares[best], options)
+        found = torque_table.fit_network(found, joint.moving, shares[best], options)
+    error = torque_table.predict(found.model, joint) - torch.as_tensor(joint.tau)
+    found = replace(found, residual=float(error.square().mean().sqrt()))
     # A dropped network has no parameters beyond its law's.
     count = int((found.model.schedule.parameter_vector() != 0).sum())
     count += len(found.model.law.coefficients) * (form != "constant")

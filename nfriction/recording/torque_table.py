@@ -92,10 +92,15 @@ class JointTorque:
         return replace(self, **some)
 
     @property
-    def sliding(self) -> JointTorque:
-        """Unordered rows without those at rest, where dry friction can have any value."""
+    def moving(self) -> JointTorque:
+        """Rows without those at rest, where dry friction can have any value."""
         fast = np.abs(self.qd) > RESTING * np.abs(self.qd).max()
-        return self if self.time is not None or fast.all() or not fast.any() else self.rows(fast)
+        return self if fast.all() or not fast.any() else self.rows(fast)
+
+    @property
+    def sliding(self) -> JointTorque:
+        """Unordered rows without those at rest; all rows in order of time."""
+        return self.moving if self.time is None else self
 
     @property
     def distinct(self) -> JointTorque:

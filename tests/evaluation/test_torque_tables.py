@@ -276,6 +276,19 @@ def test_rows_at_rest_are_excluded() -> None:
     assert float(found.score(table).rmse.iloc[0]) < 0.003
 
 
+def test_what_holds_a_joint_at_rest_does_not_shift_a_law_without_memory() -> None:
+    moving = stribeck_table(600)
+    still = pd.DataFrame({"time": 10.1 + 0.01 * np.arange(600), "qd": 1e-5, "tau": 0.9})
+    both = pd.concat([moving, still], ignore_index=True)
+    offset, alone = (
+        float(fit_torque(t, "arctan").intervals().loc["f_o of joint1", "value"])
+        for t in (both, moving)
+    )
+    assert abs(offset - alone) < 0.02
+    # Their error counts all the same, as for a law that does know what holds the joint.
+    assert fit_torque(both, "arctan").fits["NLFM"][0].residual > 0.5
+
+
 def speeds(rows: int = 10, noise: float = 0.01, seed: int = 0, ramp: float = 0.0) -> pd.DataFrame:
     """Stribeck friction at eight speeds in both directions, every 0.01 s, after ramps [rad/s²]."""
     speed = np.repeat([0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0], 2 * rows)
