@@ -339,10 +339,15 @@ def fit_torque(
     normal = [plain_name(n) for n, of in fits.items()
               if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
     for one in given.joints:
-        if normal and one.load is not None and float(one.load.min()) < 0.0:
+        # A sensor's noise without load is no sign.
+        if (
+            normal
+            and one.load is not None
+            and (negative := int((one.load < -SMALL * np.median(np.abs(one.load))).sum()))
+        ):
             remarks.append(
-                f"The load of {one.name} is negative in {int((one.load < 0).sum())} rows, but "
-                f"{' and '.join(normal)} take it for a normal force; give its magnitude. Only gear "
+                f"The load of {one.name} is negative in {negative} rows, but laws of the load "
+                f"({', '.join(normal)}) take it for a normal force; give its magnitude. Only gear "
                 "needs its sign."
             )
     choices = {}
