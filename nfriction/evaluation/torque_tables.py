@@ -336,6 +336,20 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join([*remarks, *failed.values()]))
+    normal = [plain_name(n) for n, of in fits.items()
+              if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
+    for one in given.joints:
+        # A sensor's noise without load is no sign.
+        if (
+            normal
+            and one.load is not None
+            and (negative := int((one.load < -SMALL * np.median(np.abs(one.load))).sum()))
+        ):
+            remarks.append(
+                f"The load of {one.name} is negative in {negative} rows, but laws of the load "
+                f"({', '.join(normal)}) take it for a normal force; give its magnitude. Only gear "
+                "needs its sign."
+            )
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):
         shown = _shown(given.joints[k], of)
@@ -343,9 +357,26 @@ def fit_torque(
         hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
         why += f"; measure at more speeds to judge {hidden}" * bool(hidden)
         choices[joint] = name, f"{why}{fits[name][k].note}"
+        remarks += _useless(given.joints[k], next(c for c in of if c.name == name))
         remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
     given = replace(given, remarks=tuple(remarks))
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
+
+
+def _useless(joint: JointTorque, chosen: Candidate) -> Iterator[str]:
+    """A sentence if the mean torque predicts hold-out blocks as well as the chosen model does."""
+    parts = blocks(joint, len(chosen.errors))
+    means = [joint.tau[k] - np.delete(joint.tau, k).mean() for k in parts]
+    old = torch.tensor([float(np.square(x).mean()) for x in means])
+    # Of motion in one direction, dry friction is the mean.
+    both = float(joint.qd.min() * joint.qd.max()) < 0.0
+    if both and not improves(torch.tensor(chosen.errors) ** 2, old):
+        yield (
+            f"{plain_name(chosen.name)} predicts hold-out blocks of {joint.name} no better than "
+            "the mean torque does, so its coefficients say little: the table must contain friction "
+            "only (subtract the torque of gravity and masses), no rows far off, and motion that "
+            "recurs from block to block."
+        )
 
 
 def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str]:
@@ -363,11 +394,20 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
     if len(rows) < MINIMUM_ROWS:
         return
     own = f"{plain_name(type(model).__name__)} at {joint.name}"
-    remark, cause = _cause(joint, torque, small, own, unit)
+    remembers = model.law.memory is not None
+    remark, cause = _cause(joint, torque, small, own, unit, remembers=remembers)
     error -= cause
     if remark:
         yield remark
+    # Half a step of a coarse sensor is no error, and neighbouring readings are a step apart.
+    least = max(small, 1.5 * float(np.diff(np.unique(joint.tau)).min(initial=math.inf)))
     if joint.time is not None:
+        # Along a motion the torques before and after a mistake agree with each other.
+        sound = np.median([joint.tau[:-2], joint.tau[1:-1], joint.tau[2:]], axis=0)
+        usual = joint.tau - np.median(joint.tau)
+        far = 1 + _beyond(joint.tau[1:-1] - sound, usual, least)
+        if len(far):
+            yield _listed(joint, far, own, unit)
         return
     share = max(0.5, 3 / math.sqrt(len(rows)))
     left = error[rows] - error[rows].mean()
@@ -388,27 +428,35 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
             f"the intervals do not cover. Add {better}, or a law of your own."
         )
         return
-    low, high = np.quantile(left, (0.25, 0.75))
-    # Half a step of a coarse sensor is no error, and neighbouring readings are a step apart.
-    step = float(np.diff(np.unique(joint.tau)).min(initial=math.inf))
-    reach = max(FENCE * (high - low), small, 1.5 * step)
-    far = rows[(left < low - reach) | (left > high + reach)]
+    far = rows[_beyond(left, left, least)]
     if len(far) > max(LISTED, FEW * len(rows)):
         yield (
             f"{len(far)} of {len(rows)} torques are far off {own}, as with rows recorded while "
             "accelerating; leave these out, or subtract inertia times acceleration."
         )
     elif len(far):
-        off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:LISTED])
-        more = f" and {len(far) - LISTED} more" * (len(far) > LISTED)
-        yield (
-            f"Torques far off {own}: {off}{more}. Check these rows; if they are mistakes, drop "
-            "them and fit again."
-        )
+        yield _listed(joint, far, own, unit)
+
+
+def _beyond(x: Array, usual: Array, least: float) -> NDArray[np.intp]:
+    """Rows of values outside Tukey's outer fences of usual ones, and at least this far out."""
+    low, high = np.quantile(usual, (0.25, 0.75))
+    reach = max(FENCE * (high - low), least)
+    return np.flatnonzero((x < low - reach) | (x > high + reach))
+
+
+def _listed(joint: JointTorque, far: NDArray[np.intp], own: str, unit: str) -> str:
+    """A sentence that names rows that are far off a law."""
+    off = ", ".join(f"{joint.tau[r]:.4g} at {joint.qd[r]:.4g} {unit}/s" for r in far[:LISTED])
+    more = f" and {len(far) - LISTED} more" * (len(far) > LISTED)
+    return (
+        f"Torques far off {own}: {off}{more}. Check these rows; if they are mistakes, drop them "
+        "and fit again."
+    )
 
 
 def _cause(
-    joint: JointTorque, torque: Array, small: float, own: str, unit: str
+    joint: JointTorque, torque: Array, small: float, own: str, unit: str, *, remembers: bool
 ) -> tuple[str, Array]:
     """A cause that explains more of the error of a law's torque (row,) than chance over blocks.
 
@@ -433,12 +481,15 @@ def _cause(
     ):
         return "", np.zeros_like(error)
     ways, share = ("negative", "positive")[:: 1 if sizes[1] > 0 else -1], abs(sizes[1])
+    # Rows of one direction lack the motion before them.
+    split = "neuro-fuzzy:slip follows the direction where hold-out blocks support that"
+    split = split if remembers else "fit each as a separate joint (column `joint`)"
     texts = (
         f"The torque is {abs(sizes[0]):.3g} {'N m' if unit == 'rad' else 'N'} "
         f"{'above' if sizes[0] > 0 else 'below'} {own} in both directions, as with an offset of "
         "the sensor or a constant load; subtract it and fit again, or add arctan, which has one.",
         f"Friction is {200 * share / (1 + share):.0f} % lower in the {ways[0]} direction than in "
-        f"the {ways[1]}, unlike {own}; fit each as a separate joint (column `joint`).",
+        f"the {ways[1]}, unlike {own}; {split}.",
         f"The error of {own} follows the acceleration, as with an inertia of {sizes[2]:.3g} "
         f"{'kg m²' if unit == 'rad' else 'kg'}; leave out rows recorded while accelerating, or "
         "subtract inertia times acceleration.",
@@ -557,7 +608,8 @@ def _fit(
     shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
-        rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
+        # What holds a joint at rest depends on the motion before, which these laws do not know.
+        rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test)).moving
         left = joint.rows(test)
         constant = torque_table.fit_joint(name, rest, v_smooth, options)
         for i, share in enumerate(shares):
@@ -566,9 +618,11 @@ def _fit(
             errors[i, k] = float(error.square().mean().sqrt())
     # Mean squares, so that blocks of equal length count as one table would.
     best = int(np.square(errors).mean(1).argmin())
-    found = torque_table.fit_joint(name, joint, v_smooth, options)
+    found = torque_table.fit_joint(name, joint.moving, v_smooth, options)
     if shares[best]:
-        found = torque_table.fit_network(found, joint, shares[best], options)
+        found = torque_table.fit_network(found, joint.moving, shares[best], options)
+    error = torque_table.predict(found.model, joint) - torch.as_tensor(joint.tau)
+    found = replace(found, residual=float(error.square().mean().sqrt()))
     # A dropped network has no parameters beyond its law's.
     count = int((found.model.schedule.parameter_vector() != 0).sum())
     count += len(found.model.law.coefficients) * (form != "constant")

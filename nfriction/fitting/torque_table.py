@@ -24,8 +24,9 @@ from nfriction.fitting.result.identifiability import (
 )
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.friction import model_by_name, plain_name
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.hysteresis import Recorded
-from nfriction.friction.laws import Memory
+from nfriction.friction.laws import Law, Memory
 from nfriction.friction.memory import states_along
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -89,7 +90,7 @@ def fit_joint(
         ValueError: if there are too few rows, or the law needs a load that the table lacks.
     """
     model = model_by_name(name)(1, v_smooth=v_smooth)
-    law = model.law
+    law = _for_slow(model.law, v_smooth / V_SMOOTH)
     if len(joint) <= len(law.coefficients):
         raise ValueError(
             f"{joint.name} has {len(joint)} rows, too few for the {len(law.coefficients)} "
@@ -104,7 +105,7 @@ def fit_joint(
     values = found.coefficients
     if schedule.form == "constant":
         schedule.set_parameter_vector(values.reshape(-1))
-        lower, upper = schedule.bounds()
+        lower, upper = Constant(law, 1, values).bounds()
         names = schedule.parameter_names([joint.name])
         free = (lower < upper).nonzero().flatten()
         known = Information(found.information[0], torch.zeros(len(names)).double())
@@ -123,6 +124,21 @@ def fit_joint(
         count = len(schedule.parameter_vector())
         intervals, unknown, root = (), (), torch.zeros(count, 1).double()
     return JointFit(model.requires_grad_(False), intervals, unknown, root, float(found.residual[0]))
+
+
+def _for_slow(law: Law, share: float) -> Law:
+    """A law with further start values, and so bounds, that suit slow joints and axes in m.
+
+    `share` is the width of the smoothed sign over that of the velocities which the law's own suit.
+    """
+    factor = {"rad/s": share, "s/rad": 1 / share}
+    every = (
+        replace(c, initial_grid=(*c.initial_grid, *(factor[c.unit] * x for x in c.initial_grid)))
+        if share < 1 and c.unit in factor and c.fitted
+        else c
+        for c in law.coefficients
+    )
+    return replace(law, coefficients=tuple(every))
 
 
 def fit_network(
@@ -217,8 +233,10 @@ def fit_memory(
     root[kept] = own
     names = schedule.parameter_names([joint.name])
     fitted = [names[k] for k in kept]
-    lower, upper = (bound[kept] for bound in schedule.bounds())
     values = schedule.parameter_vector()[kept]
+    # The bounds of simulations are not those of a table's slow joints.
+    upper = torch.full_like(values, torch.inf)
+    lower = torch.where(schedule.positive[kept], 0.0, -upper)
     intervals = confidence_intervals(fitted, values, own.norm(dim=1), lower, upper, model.law)
     residual = float(error.square().mean().sqrt())
     fit = JointFit(

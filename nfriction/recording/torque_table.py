@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nfriction.io import formats
 from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, slides, to_si
 from nfriction.recording.record import Unit
-from nfriction.recording.validation import Array, turns_between_samples
+from nfriction.recording.validation import Array, gaps, time_unit, turns_between_samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +46,8 @@ _LIKE = {
 MINIMUM_ROWS = 8
 # Faster joints are in degrees per second, or wheels [rad/s].
 FAST = 60.0
+# Positions follow the velocity within this factor: units differ by more, filters by less.
+FOLLOWS = 2.0
 # Share of the largest velocity up to which a joint is at rest.
 RESTING = 1e-3
 
@@ -88,10 +90,15 @@ class JointTorque:
         return replace(self, **some)
 
     @property
-    def sliding(self) -> JointTorque:
-        """Unordered rows without those at rest, where dry friction can have any value."""
+    def moving(self) -> JointTorque:
+        """Rows without those at rest, where dry friction can have any value."""
         fast = np.abs(self.qd) > RESTING * np.abs(self.qd).max()
-        return self if self.time is not None or fast.all() or not fast.any() else self.rows(fast)
+        return self if fast.all() or not fast.any() else self.rows(fast)
+
+    @property
+    def sliding(self) -> JointTorque:
+        """Unordered rows without those at rest; all rows in order of time."""
+        return self.moving if self.time is None else self
 
     @property
     def distinct(self) -> JointTorque:
@@ -243,13 +250,7 @@ class TorqueTable:
             parts.append({key: None if x is None else x[rows] for key, x in found.items()})
         joints = [_joint(*pair, remarks) for pair in zip(names, parts, strict=True)]
         for joint in joints:
-            if unit == "rad" and joint.q is not None and joint.time is not None:
-                (jumps,) = turns_between_samples(joint.q[:, None], np.empty(0, dtype=np.intp))
-                if jumps:
-                    remarks.append(
-                        f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, "
-                        "unwrap it with `numpy.unwrap`."
-                    )
+            remarks += _doubts(joint, turns=unit == "rad")
         stated = any(named for (key, _), (_, named) in sources.items() if key in ("q", "qd"))
         if unit == "rad" and not (degrees or stated):
             fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
@@ -403,6 +404,11 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         assert time is not None
         assert q is not None
         qd, qdd = _derivatives(time, q, qdd)
+        if slow := time_unit(time):
+            remarks.append(
+                f"`time` looks like {slow[1]}; if so, divide it, or read it with "
+                f'columns={{"time": "time:{slow[0]}"}}.'
+            )
     elif qdd is None:
         qdd = np.zeros_like(qd) if time is None else np.gradient(qd, time)
     assert qdd is not None
@@ -431,6 +437,31 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
             "it must be positive with positive velocity. If the sign is wrong, reverse it."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
+
+
+def _doubts(joint: JointTorque, *, turns: bool) -> Iterator[str]:
+    """Signs that positions are wrong, a sentence each."""
+    if joint.q is None or joint.time is None:
+        return
+    pauses = gaps(joint.time)
+    if turns and (jumps := int(turns_between_samples(joint.q[:, None], pauses)[0])):
+        yield (
+            f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, unwrap it "
+            "with `numpy.unwrap`."
+        )
+        return
+    moved, step = np.diff(joint.q), np.diff(joint.time)
+    expected = 0.5 * (joint.qd[1:] + joint.qd[:-1]) * step
+    # Summed, because steps between rows may be as small as an encoder's.
+    moved[pauses] = expected[pauses] = 0.0
+    moved, expected = (np.cumsum(x) - np.cumsum(x).mean() for x in (moved, expected))
+    ratio = float(moved @ expected) / max(float(expected @ expected), 1e-300)
+    if not 1 / FOLLOWS < ratio < FOLLOWS:
+        yield (
+            f"q of {joint.name} changes {ratio:.3g} times as much as qd and time say; laws with "
+            "memory follow q, other laws qd: check the sign and the unit of both, and of time, and "
+            "that both are of this joint and on the same side of its gear."
+        )
 
 
 def _derivatives(time: Array, q: Array, qdd: Array | None) -> tuple[Array, Array]:

@@ -65,6 +65,33 @@ def test_known_coefficients_are_recovered_within_their_intervals() -> None:
     assert errors["Stribeck"] < errors["CVFM"] < errors["NCFM"]
 
 
+@pytest.mark.parametrize("scale", [1e-2, 1e-4])
+def test_slow_axis_has_the_friction_of_a_fast_joint(scale: float) -> None:
+    """Start values and bounds in rad/s would give an axis in m neither a peak nor a bend."""
+    time, qd = motion(800, 0)
+    noise = 0.03 * np.random.default_rng(0).normal(size=800)
+    peak = np.tanh(qd / 1e-2) * (1 + 0.8 * np.exp(-((qd / 0.3) ** 2))) + 0.2 * qd + noise
+    bend = 0.5 * np.tanh(qd / 1e-2) + 0.3 * qd + 0.6 * np.arctan(5 * qd) + noise
+    for tau, law, name, true in ((peak, "stribeck", "v_s", 0.3), (bend, "arctan", "f_b", 5.0)):
+        table = pd.DataFrame({"time": time, "qd": scale * qd, "tau": tau})
+        found = fit_torque(table, law, unit="m")
+        factor = scale if name == "v_s" else 1 / scale
+        row = found.intervals().loc[f"{name} of joint1"]
+        assert abs(row["value"] / factor - true) < 0.15 * true
+        assert row["low"] < row["value"] < row["high"] < 2 * true * factor
+        assert float(found.to_frame().loc["joint1"].iloc[0]) < 0.1
+
+
+def test_interval_of_a_slow_bristle_contains_its_estimate() -> None:
+    time = 0.02 * np.arange(300)
+    qd = 1e-4 * (np.sin(time) + 0.5 * np.sin(2.7 * time))
+    tau = np.tanh(qd / 1e-6) * (1 + 0.5 * np.exp(-((qd / 5e-5) ** 2)))
+    tau += 0.02 * np.random.default_rng(0).normal(size=300)
+    found = fit_torque(pd.DataFrame({"time": time, "qd": qd, "tau": tau}), "lugre", unit="m")
+    row = found.intervals().loc["v_s of joint1"]
+    assert row["low"] < row["value"] < row["high"]
+
+
 def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
     """White-noise intervals would cover only about half here: the correlation time is 20 rows."""
     rng, inside, wide = np.random.default_rng(5), 0, 0.0
@@ -250,6 +277,19 @@ def test_rows_at_rest_are_excluded() -> None:
     assert float(found.score(table).rmse.iloc[0]) < 0.003
 
 
+def test_what_holds_a_joint_at_rest_does_not_shift_a_law_without_memory() -> None:
+    moving = stribeck_table(600)
+    still = pd.DataFrame({"time": 10.1 + 0.01 * np.arange(600), "qd": 1e-5, "tau": 0.9})
+    both = pd.concat([moving, still], ignore_index=True)
+    offset, alone = (
+        float(fit_torque(t, "arctan").intervals().loc["f_o of joint1", "value"])
+        for t in (both, moving)
+    )
+    assert abs(offset - alone) < 0.02
+    # Their error counts all the same, as for a law that does know what holds the joint.
+    assert fit_torque(both, "arctan").fits["NLFM"][0].residual > 0.5
+
+
 def speeds(rows: int = 10, noise: float = 0.01, seed: int = 0, ramp: float = 0.0) -> pd.DataFrame:
     """Stribeck friction at eight speeds in both directions, every 0.01 s, after ramps [rad/s²]."""
     speed = np.repeat([0.1, 0.2, 0.4, 0.8, 1.5, 3.0, 6.0, 10.0], 2 * rows)
@@ -285,6 +325,58 @@ def test_offset_and_direction_dependent_friction_are_reported(rows: int, timed: 
     (remark,) = fit_torque(less, LAWS).table.remarks
     assert remark.startswith(("Friction is 30 %", "Friction is 29 %", "Friction is 31 %"))
     assert "lower in the negative direction than in the positive" in remark
+
+
+def test_direction_is_not_split_into_joints_for_a_law_with_memory() -> None:
+    """Rows of one direction alone lack the motion that a law with memory remembers."""
+    time, qd = motion(600, 1)
+    tau = qd * np.where(qd > 0, 1.0, 0.7) + 0.02 * np.random.default_rng(1).normal(size=600)
+    table = pd.DataFrame({"time": time, "qd": qd, "tau": tau})
+    (remark,) = fit_torque(table, "slip").table.remarks
+    assert "lower in the negative direction" in remark
+    assert "neuro-fuzzy:slip follows the direction" in remark
+    assert "separate joint" not in remark
+
+
+def test_law_no_better_than_the_mean_torque_is_reported() -> None:
+    """A robot's whole torque, in which gravity hides the friction."""
+    time, qd = motion(1000, 1)
+    q = np.cumsum(qd) * (time[1] - time[0])
+    noise = 0.3 * np.random.default_rng(0).normal(size=1000)
+    table = pd.DataFrame({"time": time, "qd": qd, "tau": np.tanh(qd / 3e-3) + 0.5 * qd + noise})
+    assert not fit_torque(table, "coulomb-viscous").table.remarks
+    whole = table.assign(tau=table.tau + 60 * np.sin(q))
+    remarks = fit_torque(whole, "coulomb-viscous").table.remarks
+    assert any("blocks of joint1 no better than the mean torque" in r for r in remarks)
+    # In one direction, dry friction is the mean torque.
+    one_way = table.assign(qd=2 + 0.1 * qd, tau=1 + noise)
+    remarks = fit_torque(one_way, "coulomb").table.remarks
+    assert not any("mean torque" in r for r in remarks)
+
+
+def test_single_mistakes_along_a_motion_are_reported() -> None:
+    table = stribeck_table()
+    table.loc[[100, 900], "tau"] = 300.0
+    remarks = fit_torque(table, "coulomb-viscous").table.remarks
+    assert any(r.startswith("Torques far off coulomb-viscous at joint1: 300 at ") for r in remarks)
+    # A torque that is far off for several rows is no single mistake.
+    burst = stribeck_table()
+    burst.loc[500:540, "tau"] *= 30.0
+    remarks = fit_torque(burst, "coulomb-viscous").table.remarks
+    assert not any("far off" in r for r in remarks)
+
+
+def test_load_with_a_sign_is_reported_for_laws_of_its_magnitude() -> None:
+    table = stribeck_table(400)
+    load = 3.0 * np.sin(1.7 * table.time)
+    table = table.assign(tau=table.tau * np.abs(load))
+    (remark,) = fit_torque(table.assign(load=load), "coulomb,load-coulomb").table.remarks
+    assert remark.startswith("The load of joint1 is negative in ")
+    assert "(load-coulomb) take it for a normal force; give its magnitude" in remark
+    noisy = np.abs(load) - 1e-3
+    for given, models in ((noisy, "load-coulomb"), (load, "coulomb")):
+        remarks = fit_torque(table.assign(load=given), models).table.remarks
+        assert not any("normal force" in r for r in remarks)
 
 
 def test_sound_tables_raise_no_warning() -> None:

@@ -1,6 +1,7 @@
 """Reading tables of friction torque, and refusing invalid ones."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,31 @@ def test_suspicious_tables_raise_remarks() -> None:
     assert "degrees per second or revolutions per minute" in fast.remarks[0]
     assert not TorqueTable.from_pandas(table(qd=1e3 * QD), columns={"qd": "qd:rpm"}).remarks
     assert not TorqueTable.from_pandas(table()).remarks
+
+
+def test_positions_that_contradict_velocity_and_time_are_reported() -> None:
+    """Laws with memory follow q, and would take any unit, sign or joint for the truth."""
+    time = np.arange(1000) * 0.01
+    q = np.sin(time) + 0.3 * np.sin(5.3 * time)
+    qd = np.cos(time) + 1.59 * np.cos(5.3 * time)
+    sound = pd.DataFrame({"time": time, "q": q, "qd": qd, "tau": np.tanh(9 * qd) + qd})
+    rng = np.random.default_rng(0)
+    counted = sound.assign(q=np.round(sound.q / 0.02) * 0.02, qd=qd + 0.5 * rng.normal(size=1000))
+    # Nor do positions have to follow across a pause, or turns of a whole one there.
+    paused = sound.drop(index=range(300, 700)).assign(q=q[np.r_[:300, 700:1000]])
+    paused.loc[700:, "q"] += 2 * np.pi
+    for good in (sound, counted, paused):
+        assert not TorqueTable.from_pandas(good).remarks
+    other = np.sin(2.7 * time)
+    cases = ((-q, "-1"), (np.rad2deg(q), "57.3"), (100 * q, "100"), (other, "-?0.[01]"))
+    for wrong, factor in cases:
+        (remark,) = TorqueTable.from_pandas(sound.assign(q=wrong)).remarks
+        assert re.match(f"q of joint1 changes {factor}.* times as much as qd and time say", remark)
+    slow = sound.assign(time=1e3 * time)
+    (remark,) = TorqueTable.from_pandas(slow).remarks
+    assert "0.001 times" in remark
+    (remark,) = TorqueTable.from_pandas(slow.drop(columns="qd")).remarks
+    assert remark.startswith("`time` looks like milliseconds")
 
 
 def test_digest_depends_on_the_content() -> None:
