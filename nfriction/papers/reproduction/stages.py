@@ -31,8 +31,11 @@ from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.control import study
 from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
-from nfriction.papers.reproduction.agreement import missed_torque
-from nfriction.papers.reproduction.fresh import free_run_errors, true_positions
+from nfriction.papers.reproduction.agreement import (
+    free_run_errors,
+    missed_torque,
+    true_positions,
+)
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
