@@ -197,6 +197,11 @@ def to_html(run: Run) -> str:
         over = comparison.judged_over() if part == "test" else None
         error = (1e3 * comparison.table(over, part=part)["all"]).to_dict()
     info = next((info for _, info in run.models.values()), None)
+    commands = [["report", str(run.folder)]]
+    # Without a readable model file there is nothing to export.
+    if run.best in run.models:
+        file = str(run.folder / "models" / f"{run.best}.json")
+        commands += [["info", file], ["export", file, "--format", "c"]]
     return document(
         "page.html.j2",
         f"Friction models: {run.folder.resolve().name}",
@@ -217,7 +222,7 @@ def to_html(run: Run) -> str:
         figures=pictures(run.figures),
         fit_articles=[_fit(run, name) for name in run.fits],
         fuzzy_models=list(_fuzzy_models(run)),
-        commands=_commands(run),
+        commands=[shlex.join(["nfriction", *words]) for words in commands],
         cards=_cards(run),
     )
 
@@ -227,12 +232,18 @@ def document(template: str, title: str, **values: Any) -> str:
     style, script = (
         (_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
     )
+    # Hashes, because "unsafe-inline" would let injected code run.
+    of_style, of_script = (
+        base64.b64encode(hashlib.sha256(t.encode()).digest()).decode() for t in (style, script)
+    )
     page: str = _JINJA.get_template(template).render(
         {"run_id": ""} | values,
         title=title,
         style=Markup(style),
         script=Markup(script),
-        policy=_policy(style, script),
+        # Only this style, this script, and pictures that are in the page.
+        policy=f"default-src 'none'; img-src data:; style-src 'sha256-{of_style}'; "
+        f"script-src 'sha256-{of_script}'; base-uri 'none'; form-action 'none'",
         version=__version__,
     )
     return page.lstrip() + "\n"
@@ -261,18 +272,6 @@ def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
         size = {"width": figure.width, "height": figure.height}
         found.append((rank, {"caption": caption, "url": url, **size}))
     return [picture for _, picture in sorted(found, key=lambda pair: pair[0])]
-
-
-def _policy(style: str, script: str) -> str:
-    """Content policy: only this style, this script, and pictures that are in the page."""
-    # Hashes, because "unsafe-inline" would let injected code run.
-    of_style, of_script = (
-        base64.b64encode(hashlib.sha256(t.encode()).digest()).decode() for t in (style, script)
-    )
-    return (
-        f"default-src 'none'; img-src data:; style-src 'sha256-{of_style}'; "
-        f"script-src 'sha256-{of_script}'; base-uri 'none'; form-action 'none'"
-    )
 
 
 def _fit(run: Run, name: str) -> dict[str, Any]:
@@ -436,13 +435,3 @@ def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> tables.Ta
         return None
     rows = tuple(zip(joints, *ends, strict=True))
     return tables.Table("Motion that the models were trained on", ("joint", *columns), rows)
-
-
-def _commands(run: Run) -> list[str]:
-    lines = [shlex.join(["nfriction", "report", str(run.folder)])]
-    # Without a readable model file there is nothing to export.
-    if run.best in run.models:
-        file = str(run.folder / "models" / f"{run.best}.json")
-        lines.append(shlex.join(["nfriction", "info", file]))
-        lines.append(shlex.join(["nfriction", "export", file, "--format", "c"]))
-    return lines

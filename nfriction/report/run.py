@@ -143,7 +143,17 @@ def read_run(folder: str | Path) -> Run:
     # From a file of another program with a matching checksum.
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RunError(f"{path}: not results of a comparison ({error!r:.200}).") from error
-    _require_one_run(run)
+    foreign = [
+        f"models/{name}.json"
+        for name, (_, info) in run.models.items()
+        if info.fit.get("run", "") != run.id
+    ]
+    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
+    if foreign:
+        raise RunError(
+            f"{folder} has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"results.json; run the comparison again, or give a folder that a single run wrote."
+        )
     return run
 
 
@@ -268,18 +278,3 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
         run = _RUN.search(data[:4096])
         found.append(Figure(path.stem, data, width, height, run[1].decode() if run else ""))
     return tuple(found), notes
-
-
-def _require_one_run(run: Run) -> None:
-    """Refuse models and figures from another run than the results."""
-    foreign = [
-        f"models/{name}.json"
-        for name, (_, info) in run.models.items()
-        if info.fit.get("run", "") != run.id
-    ]
-    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
-    if foreign:
-        raise RunError(
-            f"{run.folder} has files of two runs: {', '.join(foreign)} belong to another run than "
-            f"results.json; run the comparison again, or give a folder that a single run wrote."
-        )
