@@ -136,11 +136,23 @@ def _interpret(
     name = _name(func)
     in_place = func._schema.is_mutable
     if name in ("_local_scalar_dense", "item", "is_nonzero"):
-        return _concrete(leaves[0], name)
+        if leaves[0].nodes.flat[0].op != "constant":
+            raise UnsupportedOperation(
+                name, "asks for a value that is known only at run time (use `torch.where`)"
+            )
+        return leaves[0].example.item()
     operation = OPERATIONS.get(name.removesuffix("_") if in_place else name)
     if operation is None or (in_place and not isinstance(args[0], ScalarTensor)):
         with watch:  # a mode is off inside its own handler
-            return _decomposed(func, name, args, kwargs)
+            if not in_place:
+                composite = func.decompose(*args, **kwargs)
+                if composite is not NotImplemented:
+                    return composite
+                from torch._decomp import decomposition_table
+
+                if func in decomposition_table:
+                    return decomposition_table[func](*args, **kwargs)
+            raise UnsupportedOperation(name)
 
     def nodes_of(leaf: Any) -> Any:
         if isinstance(leaf, ScalarTensor):
@@ -155,9 +167,24 @@ def _interpret(
     own, named = given(lambda x: x.example if isinstance(x, ScalarTensor) else x)
     example = func(*own, **named)
     if torch.Tag.inplace_view in func.tags:
-        return _reshape_in_place(args[0], nodes, func, args, kwargs)
+        # `squeeze_` and similar (used by torch's `linear`) only change shape and strides.
+        included = torch._C._meta_in_tls_dispatch_include()
+        torch._C._set_meta_in_tls_dispatch_include(True)
+        try:
+            with no_dispatch():
+                func(*args, **kwargs)
+        finally:
+            torch._C._set_meta_in_tls_dispatch_include(included)
+        args[0].nodes = nodes
+        return args[0]
     if in_place:
-        return _write(args[0], nodes, name)
+        target = args[0]
+        if target.is_floating_point() and target.dtype != torch.float64:
+            raise UnsupportedOperation(name, f"writes in place into {target.dtype}, not float64")
+        if not target.nodes.flags.writeable:
+            raise UnsupportedOperation(name, "writes in place through a view that is not traced")
+        target.nodes[...] = nodes
+        return target
     if isinstance(example, (tuple, list)):
         wrapped = [_wrap(n, e, graph, name, leaves) for n, e in zip(nodes, example, strict=True)]
         return type(example)(wrapped)
@@ -180,51 +207,6 @@ def _wrap(
     if nodes.shape != tuple(example.shape):
         raise AssertionError(f"`{name}` traced to {nodes.shape}, not {tuple(example.shape)}")
     return ScalarTensor(nodes, example, graph)
-
-
-def _write(target: ScalarTensor, nodes: np.ndarray, name: str) -> ScalarTensor:
-    if target.is_floating_point() and target.dtype != torch.float64:
-        raise UnsupportedOperation(name, f"writes in place into {target.dtype}, not float64")
-    if not target.nodes.flags.writeable:
-        raise UnsupportedOperation(name, "writes in place through a view that is not traced")
-    target.nodes[...] = nodes
-    return target
-
-
-def _reshape_in_place(
-    target: ScalarTensor, nodes: np.ndarray, func: Any, args: Any, kwargs: Any
-) -> ScalarTensor:
-    """`squeeze_` and similar (used by torch's `linear`), which only change shape and strides."""
-    included = torch._C._meta_in_tls_dispatch_include()
-    torch._C._set_meta_in_tls_dispatch_include(True)
-    try:
-        with no_dispatch():
-            func(*args, **kwargs)
-    finally:
-        torch._C._set_meta_in_tls_dispatch_include(included)
-    target.nodes = nodes
-    return target
-
-
-def _concrete(tensor: ScalarTensor, name: str) -> Any:
-    node = tensor.nodes.flat[0]
-    if node.op != "constant":
-        raise UnsupportedOperation(
-            name, "asks for a value that is known only at run time (use `torch.where`)"
-        )
-    return tensor.example.item()
-
-
-def _decomposed(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    if not func._schema.is_mutable:
-        composite = func.decompose(*args, **kwargs)
-        if composite is not NotImplemented:
-            return composite
-        from torch._decomp import decomposition_table
-
-        if func in decomposition_table:
-            return decomposition_table[func](*args, **kwargs)
-    raise UnsupportedOperation(name)
 
 
 def trace(
@@ -251,15 +233,13 @@ def trace(
     # Without gradients, because autograd would needlessly wrap every traced tensor.
     with torch.no_grad(), _Watch(graph):
         outputs = function(**arguments)
-    outputs = outputs if isinstance(outputs, (tuple, list)) else (outputs,)
-    return Program(graph, tuple(ports), tuple(_output(graph, i, o) for i, o in enumerate(outputs)))
-
-
-def _output(graph: Graph, index: int, output: Any) -> Port:
-    if not isinstance(output, Tensor):
-        raise ValueError(f"a compiled function returns tensors, got {type(output).__name__}.")
-    nodes = output.nodes if isinstance(output, ScalarTensor) else constants(graph, output)
-    return Port(f"out{index}", tuple(output.shape), tuple(nodes.ravel()))
+    found = []
+    for i, output in enumerate(outputs if isinstance(outputs, (tuple, list)) else (outputs,)):
+        if not isinstance(output, Tensor):
+            raise ValueError(f"a compiled function returns tensors, got {type(output).__name__}.")
+        computed = output.nodes if isinstance(output, ScalarTensor) else constants(graph, output)
+        found.append(Port(f"out{i}", tuple(output.shape), tuple(computed.ravel())))
+    return Program(graph, tuple(ports), tuple(found))
 
 
 class FunctionalModule:
