@@ -1,7 +1,7 @@
 """Choose a law on training data alone, by cross-validation over blocks of time."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral, Real
@@ -13,7 +13,7 @@ import pandas as pd
 import torch
 
 from nfriction.evaluation.lead_in import longest_window
-from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
+from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.inputs import (
     apply_encoder_offsets,
@@ -162,13 +162,23 @@ def select(
     for k in range(folds):
         label = f"fold {k + 1} of {folds}: fit"
         # Staggered, so that no fold leaves out the same part of every recording.
-        chosen = [row[(k + i) % folds] for i, row in enumerate(by_recording)]
-        test[label] = [fold.test for fold in chosen]
-        left = [fold.train for fold in chosen]
+        out = [row[(k + i) % folds] for i, row in enumerate(by_recording)]
+        test[label] = [fold.test for fold in out]
+        left = [fold.train for fold in out]
         train[label] = Data([b.recording for b in left], [b.motion for b in left])
     fits = fit_models(plant, names, train, jobs=jobs, progress=progress, **fit_settings)
-    candidates = tuple(_candidate(plant, name, fits, test, horizon) for name in names)
-    return Selection(*choose(candidates, plant.unit), candidates, horizon, plant.unit)
+    candidates = []
+    for name in names:
+        errors: list[float] = []
+        converged = True
+        for label, blocks in test.items():
+            found = fits[label].found.get(name)
+            converged &= found is not None and found.converged
+            errors += block_errors(found, blocks, horizon) if found else [math.inf] * len(blocks)
+        parameters = model_by_name(name)(plant.joints).schedule.parameter_vector().numel()
+        candidates.append(Candidate(name, tuple(errors), parameters, converged))
+    chosen = choose(candidates, plant.unit)
+    return Selection(*chosen, tuple(candidates), horizon, plant.unit)
 
 
 def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]:
@@ -210,24 +220,6 @@ def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) 
         for r in recordings
     ]
     return [scored.windows[f"{horizon:g}"].all for scored in scores]
-
-
-def _candidate(
-    plant: Plant,
-    name: str,
-    fits: Mapping[str, Fits],
-    test: Mapping[str, list[TimeBlock]],
-    horizon: float,
-) -> Candidate:
-    """The errors of a model on the blocks that its fits have not seen."""
-    errors: list[float] = []
-    converged = True
-    for label, blocks in test.items():
-        found = fits[label].found.get(name)
-        converged &= found is not None and found.converged
-        errors += block_errors(found, blocks, horizon) if found else [math.inf] * len(blocks)
-    parameters = model_by_name(name)(plant.joints).schedule.parameter_vector().numel()
-    return Candidate(name, tuple(errors), parameters, converged)
 
 
 def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str]:
