@@ -1,9 +1,8 @@
 """Verify an artefact against a model file: with its own vectors, and at many random points."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from nfriction.export.c_file import c_contract, c_runner
 from nfriction.export.contract import (
@@ -85,18 +84,33 @@ def verify_artefact(
         info = replace(info or ModelInfo(), sample_time=contract.description.get("sample_time"))
     except (TypeError, ValueError) as error:
         raise ContractError(f"the metadata's sample time is damaged ({error}).") from error
-    controller = _controller(model, info, contract.description)
+    about = contract.description
+    if about.get("joints") != model.joints:
+        raise ExportError(
+            f"the artefact has {about.get('joints')!r} joints, the model {model.joints}."
+        )
+    filtered = about.get("filter")
+    try:
+        controller = controller_of(
+            model,
+            info,
+            torque_limit=about.get("torque_limit"),
+            with_filter=filtered is not None,
+            cutoff_hz=filtered["cutoff_hz"] if filtered else 20.0,
+        )
+    except (TypeError, KeyError, ValueError) as error:
+        raise ContractError(f"the metadata's filter or limit is damaged ({error}).") from error
     # With the model's own contract, because tolerance and scales of a manipulated artefact might
     # accept anything.
-    own = contract_of(model, controller, info, dtype=contract.description["dtype"])
+    own = contract_of(model, controller, info, dtype=about["dtype"])
     count = min(points, MOST_SUCCESSIVE) if controller.state_size else points
     inputs = draw(controller, count, seed)
-    if contract.description["dtype"] == "float32":
+    if about["dtype"] == "float32":
         inputs = tuple(x.float().double() for x in inputs)
     differences = tuple(
-        f"{what} {str(contract.description.get(key))[:16]} instead of {own.description[key][:16]}"
+        f"{what} {str(about.get(key))[:16]} instead of {own.description[key][:16]}"
         for what, key in (("model", "model"), ("parameters", "parameter_hash"))
-        if contract.description.get(key) != own.description[key]
+        if about.get(key) != own.description[key]
     )
     try:
         run = runner(path, controller)
@@ -114,24 +128,3 @@ def verify_artefact(
             raise
         raise ExportError(f"{path}: cannot be run by its metadata ({error}).") from error
     return Verdict(at_vectors, at_points, differences)
-
-
-def _controller(
-    model: FrictionModel, info: ModelInfo | None, described: Mapping[str, Any]
-) -> Controller:
-    """The controller that the artefact claims to be, made from the model."""
-    if described.get("joints") != model.joints:
-        raise ExportError(
-            f"the artefact has {described.get('joints')!r} joints, the model {model.joints}."
-        )
-    filtered = described.get("filter")
-    try:
-        return controller_of(
-            model,
-            info,
-            torque_limit=described.get("torque_limit"),
-            with_filter=filtered is not None,
-            cutoff_hz=filtered["cutoff_hz"] if filtered else 20.0,
-        )
-    except (TypeError, KeyError, ValueError) as error:
-        raise ContractError(f"the metadata's filter or limit is damaged ({error}).") from error
