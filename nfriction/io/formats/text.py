@@ -11,6 +11,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Iterable
+from itertools import takewhile
 from pathlib import Path
 
 import pandas as pd
@@ -94,7 +95,12 @@ def parse_csv(text: str) -> pd.DataFrame:
         if named[1] not in table.columns and (is_unit(named[2]) or alike == [column]):
             aliases.setdefault(named[1], column)
     repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
-    settings = _comments(text)
+    # In comment lines before the header.
+    settings = {}
+    for line in takewhile(_is_comment, io.StringIO(text)):
+        key, _, value = line.lstrip()[1:].partition(":")
+        if key.strip() in (*ATTRIBUTES, "decimal"):
+            settings[key.strip()] = value.strip()
     # Files that separate cells by commas hardly use commas in numbers.
     usual = "." if separator == "," else ","
     decimal, undecided = decimal_sign(table, settings.pop("decimal", None), usual)
@@ -114,18 +120,6 @@ def _decoded(content: bytes) -> str:
     except UnicodeDecodeError:
         # Older loggers use this encoding, in which every byte is a letter.
         return content.decode("latin-1")
-
-
-def _comments(text: str) -> dict[str, str]:
-    """Settings in comment lines before the header."""
-    found = {}
-    for line in io.StringIO(text):
-        if not _is_comment(line):
-            break
-        key, _, value = line.lstrip()[1:].partition(":")
-        if key.strip() in (*ATTRIBUTES, "decimal"):
-            found[key.strip()] = value.strip()
-    return found
 
 
 def _is_comment(line: str) -> bool:
