@@ -43,16 +43,6 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
     return FrictionModel(flat, _Sampled(model, flat, step), model.v_smooth)
 
 
-def _moved_by_load(model: FrictionModel, step: float) -> bool:
-    """True where the state of a model's law depends on the load."""
-    law, c = model.law, model.schedule.rest_coefficients().detach()
-    qd = torch.linspace(-1.0, 1.0, 7, dtype=c.dtype)[:, None].expand(-1, model.joints)
-    assert law.memory is not None
-    state = law.initial_state(qd)
-    loaded, unloaded = (law.memory.advance(state, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
-    return not torch.equal(loaded, unloaded)
-
-
 # A module and no closure, which TorchScript would not compile.
 class _Torque(nn.Module):
     """Torque of the law, its state the last of the coefficients."""
@@ -83,7 +73,12 @@ class _Sampled(Schedule):
         self.sample_time = sample_time
         self.given = model.schedule
         self.law_advance = model.law.memory.advance
-        self.loaded = _moved_by_load(model, sample_time)
+        # With two loads, its state moves to two places if it depends on the load.
+        c = model.schedule.rest_coefficients().detach()
+        qd = torch.linspace(-1.0, 1.0, 7, dtype=c.dtype)[:, None].expand(-1, model.joints)
+        start = model.law.initial_state(qd)
+        moved = [self.law_advance(start, qd, x, c, sample_time) for x in (qd + 2.0, 0.0 * qd)]
+        self.loaded = not torch.equal(*moved)
         step = torch.tensor(sample_time, dtype=torch.float64)
         self.register_buffer("step", step, persistent=False)
         self.register_buffer("rest", step.new_zeros(self.state_size), persistent=False)

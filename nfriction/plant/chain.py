@@ -43,35 +43,6 @@ class Arm:
             object.__setattr__(self, name, value)
 
 
-def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
-    if gravity < WEIGHTLESS:
-        raise ValueError(
-            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; write "
-            f"{WEIGHTLESS:g} for links in a horizontal plane (one joint alone: the kind rotor)."
-        )
-    if not isinstance(arm, Arm | None):
-        raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
-    if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
-        raise ValueError(
-            '`normal_load` must be "link" or, for a chain on a fixed pivot, "bearing", got '
-            f"{normal_load!r}."
-        )
-
-
-def _rotor_inertia(
-    motor: Motor | None, armature: Sequence[float] | Tensor | None, joints: int
-) -> Tensor:
-    """Rotor inertia seen at each joint, from the motors or as given, (joints,)."""
-    rotor = (motor or Motor()).reflected_inertia(joints)
-    if armature is not None:
-        if rotor.any():
-            raise ValueError("give `armature` or the motor's `rotor_inertia`, not both.")
-        rotor = vector("armature", armature, joints)
-    if (rotor < 0).any():
-        raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
-    return rotor
-
-
 class _Geometry(NamedTuple):
     pose: dynamics.Pose
     arm: dynamics.ArmTerms | None
@@ -163,7 +134,18 @@ class PendulumChain(Plant):
     ) -> None:
         m = vector("mass", mass, None, positive=True)
         gravity = number("gravity", gravity)
-        _check_options(gravity, arm, normal_load)
+        if gravity < WEIGHTLESS:
+            raise ValueError(
+                f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; write "
+                f"{WEIGHTLESS:g} for links in a horizontal plane (one joint alone: the kind rotor)."
+            )
+        if not isinstance(arm, Arm | None):
+            raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
+        if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
+            raise ValueError(
+                '`normal_load` must be "link" or, for a chain on a fixed pivot, "bearing", got '
+                f"{normal_load!r}."
+            )
         links, first = len(m), int(arm is not None)
         super().__init__(
             first + links,
@@ -178,7 +160,13 @@ class PendulumChain(Plant):
         size = vector("length", length, links, positive=True)
         centre = size / 2 if com is None else vector("com", com, links)
         tensors = inertia_tensors(inertia, links)
-        rotor = _rotor_inertia(motor, armature, self.joints)
+        rotor = (motor or Motor()).reflected_inertia(self.joints)
+        if armature is not None:
+            if rotor.any():
+                raise ValueError("give `armature` or the motor's `rotor_inertia`, not both.")
+            rotor = vector("armature", armature, self.joints)
+        if (rotor < 0).any():
+            raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
         self.bearing_load = normal_load == "bearing"
         self.has_link_load = not self.bearing_load and not arm and "normal_load" in self.optional
         lever = dynamics.bearing_lever(m, size, centre) if self.bearing_load else centre

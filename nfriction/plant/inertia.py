@@ -33,27 +33,22 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
             f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for "
             f"(Ixx, Iyy, Izz, Ixy, Ixz, Iyz), got shape {tuple(given.shape)}."
         )
-    # Only a warning, because identified values absorb effects that a model omits.
-    _warn_impossible(rows)
-    return rows
-
-
-def _warn_impossible(rows: Tensor) -> None:
-    """Warn unless principal inertias are >= 0 and obey the triangle inequality."""
     xx, yy, zz, xy, xz, yz = rows.unbind(-1)
     matrix = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     small, middle, large = torch.linalg.eigvalsh(matrix).unbind(-1)
     # A slender rod lies on the border: round-off must not cause a warning.
     slack = 1e-9 * rows.abs().amax(-1)
     wrong = (small < -slack) | (large > small + middle + slack)
+    # Only a warning, because identified values absorb effects that a model omits.
     if wrong.any():
-        links = [i + 1 for i in wrong.nonzero().flatten().tolist()]
+        bad = [i + 1 for i in wrong.nonzero().flatten().tolist()]
         warnings.warn(
-            f"the inertia of link {links} about its mass centre belongs to no rigid body "
+            f"the inertia of link {bad} about its mass centre belongs to no rigid body "
             f"(principal inertias must be >= 0 and obey the triangle inequality): "
             f"{rows[wrong].tolist()}; if it was identified, the motion may still be right.",
-            stacklevel=4,
+            stacklevel=3,
         )
+    return rows
 
 
 # Values of the buffers, and M^-1 over the grid for them. Cached, because every rollout needs it and

@@ -139,8 +139,15 @@ def control(
     diverged_at = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
     for k in range(steps):
         reading = electronics.read(q.numpy())
+        time = k * sample_time
+        wanted = np.asarray(controller(time, reading), dtype=np.float64)
+        if wanted.shape != reading.shape or not np.isfinite(wanted).all():
+            raise ValueError(
+                f"the controller must return finite torques {reading.shape}, got shape "
+                f"{wanted.shape} at {time:g} s."
+            )
         # Encoders are read before the torque of the sample acts; delayed torques act first.
-        waiting.append(electronics.drive(_wanted(controller, k * sample_time, reading)))
+        waiting.append(electronics.drive(wanted))
         tau = torch.as_tensor(waiting.pop(0)).clone()
         if stateful is not None:
             motion = qd, states[-1][2]
@@ -172,14 +179,3 @@ def control(
         step.expand(steps), q, qd, qdd, diverged_at, *law,
         tau=torch.stack(torques, -2), measured=torch.stack(readings, -2),
     )  # fmt: skip
-
-
-def _wanted(controller: Feedback, time: float, reading: Array) -> Array:
-    """Torque that the controller commands."""
-    wanted = np.asarray(controller(time, reading), dtype=np.float64)
-    if wanted.shape != reading.shape or not np.isfinite(wanted).all():
-        raise ValueError(
-            f"the controller must return finite torques {reading.shape}, got shape "
-            f"{wanted.shape} at {time:g} s."
-        )
-    return wanted

@@ -100,7 +100,11 @@ def memory_step(
     v = goal
     found, after = friction_at(v)
     for _ in range(ITERATIONS):
-        slope = _chord(found - stuck, v, steepest)
+        # The slope of the torque from rest to the velocity. At a deflection against the motion it
+        # is up to twice that of the contact at rest.
+        same = v.abs() < SLOW
+        chord = ((found - stuck) / torch.where(same, 1.0, v)).clamp(min=0.0)
+        slope = torch.where(same, steepest, torch.minimum(chord, 2.0 * steepest))
         v = _solve(mobility, reach.unbind(-1), slope.unbind(-1), list(free.unbind(-1)))
         found, after = friction_at(v)
 
@@ -120,14 +124,6 @@ def unit_responses(plant: Plant, q: Tensor, zero: Tensor) -> list[tuple[Tensor, 
         (plant.forward_dynamics(q, zero, zero + unit[j]) - rest).unbind(-1)
         for j in range(plant.joints)
     ]
-
-
-def _chord(rise: Tensor, run: Tensor, steepest: Tensor) -> Tensor:
-    """Slope of a torque from rest to a velocity."""
-    same = run.abs() < SLOW
-    slope = (rise / torch.where(same, 1.0, run)).clamp(min=0.0)
-    # At a deflection against the motion it is up to twice that of the contact at rest.
-    return torch.where(same, steepest, torch.minimum(slope, 2.0 * steepest))
 
 
 def _product(matrix: Sequence[Sequence[Tensor]], vector: Tensor) -> Tensor:
