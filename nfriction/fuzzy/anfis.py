@@ -68,10 +68,29 @@ class Anfis(LinearOutputModule):
     ) -> None:
         super().__init__()
         self.terms = [operator.index(count) for count in terms]
-        _check_sizes(groups, inputs, self.terms, outputs, order, kind)
+        if min(groups, inputs, outputs) < 1:
+            raise ValueError(
+                f"`groups`, `inputs` and `outputs` must be at least 1, got {groups}, {inputs}, "
+                f"{outputs}."
+            )
+        if len(self.terms) != inputs or min(self.terms) < 1:
+            raise ValueError(
+                f"`terms` needs a positive number of sets for each of {inputs} inputs, got "
+                f"{self.terms}."
+            )
+        self.rules = math.prod(self.terms)
+        if self.rules > MAX_RULES:
+            raise ValueError(
+                f"{self.terms} sets make {self.rules} rules, more than {MAX_RULES}; use fewer sets."
+            )
+        if order not in (0, 1):
+            raise ValueError(
+                f"`order` is 0 (constant consequents) or 1 (linear ones), got {order}."
+            )
+        if kind not in ("gaussian", "bell"):
+            raise ValueError(f'`kind` is "gaussian" or "bell", got {kind!r}.')
         self.groups, self.inputs, self.outputs, self.order = groups, inputs, outputs, order
         self.kind, self.interpretable = kind, interpretable
-        self.rules = math.prod(self.terms)
         partition: FreePartition | OrderedPartition = FreePartition(groups, self.terms)
         if interpretable:
             half_width = HALF_WIDTH_OF_GAUSSIAN if kind == "gaussian" else 1.0
@@ -193,7 +212,18 @@ class Anfis(LinearOutputModule):
         F = u.new_empty(shape) if out is None else out
         strengths, terms = self.strength_columns(u), self._terms(u)
         self._write_regressors(F[:, :shared], strengths, terms)
-        z, h, by_slope = self._premises(u)
+        # z, h and, for bells, dlog m/dlog b, each (groups, sets, samples).
+        centres, widths = (part.unsqueeze(-1) for part in self.sets())
+        z = torch.repeat_interleave(u, torch.tensor(self.terms, device=u.device), 1)
+        h = z = z.sub_(centres).div_(widths)
+        by_slope = None
+        if self.log_slopes is not None:
+            slope = torch.exp(self.log_slopes).unsqueeze(-1)
+            one = torch.ones_like(slope)
+            outside = -slope * torch.expm1(log_bell(z, 0.0 * one, one, slope))
+            # The same tiny offset from zero as in the membership.
+            square = z * z + 1e-37
+            h, by_slope = 2.0 * outside * z / square, -outside * square.log()
         # Summing the strengths over the rules that use a set gives the set's share p.
         choice = torch.cartesian_prod(*(torch.arange(n) for n in self.terms))
         choice = choice.reshape(-1, len(self.terms))
@@ -266,20 +296,6 @@ class Anfis(LinearOutputModule):
     def _write_regressors(self, out: Tensor, strengths: Tensor, terms: Tensor) -> None:
         by_rule = out.unflatten(1, (strengths.shape[1], terms.shape[1]))
         torch.mul(strengths.unsqueeze(2), terms.unsqueeze(1), out=by_rule)
-
-    def _premises(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """z, h = -dlog m/dz and, for bells, dlog m/dlog b, each (groups, sets, samples)."""
-        centres, widths = (part.unsqueeze(-1) for part in self.sets())
-        z = torch.repeat_interleave(u, torch.tensor(self.terms, device=u.device), 1)
-        z = z.sub_(centres).div_(widths)
-        if self.log_slopes is None:
-            return z, z, None
-        slope = torch.exp(self.log_slopes).unsqueeze(-1)
-        one = torch.ones_like(slope)
-        outside = -slope * torch.expm1(log_bell(z, 0.0 * one, one, slope))
-        # The same tiny offset from zero as in the membership.
-        square = z * z + 1e-37
-        return z, 2.0 * outside * z / square, -outside * square.log()
 
     def init_grid(self, lower: Range, upper: Range) -> None:
         """Evenly spaced sets from `lower` to `upper`, with neighbours crossing at 0.5.
@@ -374,24 +390,3 @@ class Anfis(LinearOutputModule):
             [piece.expand(self.groups, n) for piece, n in zip(pieces, self.terms, strict=True)], 1
         )
         return packed.to(self.consequents)
-
-
-def _check_sizes(
-    groups: int, inputs: int, terms: list[int], outputs: int, order: int, kind: str
-) -> None:
-    if min(groups, inputs, outputs) < 1:
-        raise ValueError(
-            f"`groups`, `inputs` and `outputs` must be at least 1, got {groups}, {inputs}, "
-            f"{outputs}."
-        )
-    if len(terms) != inputs or min(terms) < 1:
-        raise ValueError(
-            f"`terms` needs a positive number of sets for each of {inputs} inputs, got {terms}."
-        )
-    rules = math.prod(terms)
-    if rules > MAX_RULES:
-        raise ValueError(f"{terms} sets make {rules} rules, more than {MAX_RULES}; use fewer sets.")
-    if order not in (0, 1):
-        raise ValueError(f"`order` is 0 (constant consequents) or 1 (linear ones), got {order}.")
-    if kind not in ("gaussian", "bell"):
-        raise ValueError(f'`kind` is "gaussian" or "bell", got {kind!r}.')
