@@ -197,6 +197,12 @@ def to_html(run: Run) -> str:
         over = comparison.judged_over() if part == "test" else None
         error = (1e3 * comparison.table(over, part=part)["all"]).to_dict()
     info = next((info for _, info in run.models.values()), None)
+    heads = ("recording", "part", "digest of its samples")
+    digests = tuple(
+        (name, PART_NAMES[part].removesuffix("s"), digest[:16])
+        for part in reversed(PART_NAMES)
+        for name, digest in run.recordings[part].items()
+    )
     commands = [["report", str(run.folder)]]
     # Without a readable model file there is nothing to export.
     if run.best in run.models:
@@ -216,7 +222,7 @@ def to_html(run: Run) -> str:
             "errors": [tables.error_table(comparison, part) for part in comparison.parts],
             "recordings": _recording_table(run),
             "selection": run.selection and tables.selection_table(run.selection),
-            "data": _data_table(run),
+            "data": tables.Table("Recordings", heads, digests),
             "ranges": info and _range_table(info, comparison.joint_names, comparison.unit),
         },
         figures=pictures(run.figures),
@@ -408,15 +414,6 @@ def _recording_table(run: Run) -> tables.Table:
          "diverged", f"zero of the encoders [m{unit}]"),
         tuple(rows), "diverged",
     )  # fmt: skip
-
-
-def _data_table(run: Run) -> tables.Table:
-    rows = tuple(
-        (name, PART_NAMES[part].removesuffix("s"), digest[:16])
-        for part in reversed(PART_NAMES)
-        for name, digest in run.recordings[part].items()
-    )
-    return tables.Table("Recordings", ("recording", "part", "digest of its samples"), rows)
 
 
 def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> tables.Table | None:

@@ -171,6 +171,13 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     fits = {name: FitRecord.of(entry["fit"]) for name, entry in entries.items() if "fit" in entry}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = _figures(folder / "figures")
+    selection = None
+    if (of := content.get("selection")) is not None:
+        candidates = tuple(
+            Candidate(name, tuple(map(_number, c["blocks"])), c["parameters"], c["converged"])
+            for name, c in of["candidates"].items()
+        )
+        selection = Selection(of["chosen"], of["reason"], candidates, of["horizon"], unit)
     comparison = Comparison(
         {}, scores["train"], scores["test"], unit, joints, failed=content.get("failed", {}),
         test_warnings=tuple(content.get("test_warnings", ())),
@@ -194,7 +201,7 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         models=models,
         figures=figures,
         notes=(*notes, *unread),
-        selection=_selection(content.get("selection"), unit),
+        selection=selection,
     )
 
 
@@ -218,16 +225,6 @@ def _score(recording: str, of: dict[str, Any]) -> Score:
         errors.free_run, errors.windows, of["limit"] and _errors(of["limit"]), recording,
         nothing, nothing, _number(of["diverged_at"]), zero,
     )  # fmt: skip
-
-
-def _selection(of: dict[str, Any] | None, unit: str) -> Selection | None:
-    if of is None:
-        return None
-    candidates = tuple(
-        Candidate(name, tuple(map(_number, c["blocks"])), c["parameters"], c["converged"])
-        for name, c in of["candidates"].items()
-    )
-    return Selection(of["chosen"], of["reason"], candidates, of["horizon"], unit)
 
 
 def _coefficients(of: dict[str, Any]) -> Coefficients:
