@@ -22,12 +22,11 @@ from nfriction.papers.twin.dataset import (
     sample_count,
     specification,
 )
-from nfriction.papers.twin.mechanics import Links, simulate
+from nfriction.papers.twin.mechanics import Array, Links, simulate
 from nfriction.plant import PendulumChain, Plant
 from nfriction.simulation.rollout import rollout
 from nfriction.simulation.validate import required_substeps
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 EQUATIONS, TWIN, MUJOCO = "equations", "independent mechanics", "MuJoCo"
@@ -62,7 +61,16 @@ def simulations(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> dict
         ).q,
     }
     if importlib.util.find_spec("mujoco") is not None:
-        found[MUJOCO] = _by_mujoco(plant, q0, qd0, steps)
+        import mujoco  # an optional dependency
+
+        model: Any = mujoco.MjModel.from_xml_string(_mjcf(plant))
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = q0, qd0
+        motion = [data.qpos.copy()]
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+            motion.append(data.qpos.copy())
+        found[MUJOCO] = np.array(motion)
     return found
 
 
@@ -87,19 +95,6 @@ def agreement(plant: PendulumChain, q0: Array, qd0: Array) -> pd.DataFrame:
     return pd.DataFrame.from_dict(
         rows, orient="index", columns=[f"until {h:g} s [rad]" for h in HORIZONS]
     )
-
-
-def _by_mujoco(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> Array:
-    import mujoco  # an optional dependency
-
-    model: Any = mujoco.MjModel.from_xml_string(_mjcf(plant))
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = q0, qd0
-    motion = [data.qpos.copy()]
-    for _ in range(steps):
-        mujoco.mj_step(model, data)
-        motion.append(data.qpos.copy())
-    return np.array(motion)
 
 
 def _mjcf(plant: PendulumChain) -> str:

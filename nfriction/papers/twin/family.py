@@ -28,10 +28,8 @@ from tqdm import tqdm
 from nfriction.evaluation.compare import Comparison
 from nfriction.io.files import write_atomically
 from nfriction.papers.twin.dataset import RATE, Encoder, Release, Twin, record, sample_count, write
-from nfriction.papers.twin.mechanics import Links, TrueMotion, Vector
+from nfriction.papers.twin.mechanics import Array, Links, TrueMotion, Vector
 from nfriction.plant import rigs
-
-Array = NDArray[np.float64]
 
 DURATION = 20.0  # of a release [s]
 HELD_OUT = 10  # test releases
@@ -129,7 +127,12 @@ def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: boo
     random = np.random.default_rng([seed, OF_RELEASES])
     chosen: list[tuple[Vector, TrueMotion]] = []
     while len(chosen) < 2 + HELD_OUT:
-        poses = [_pose(random, upright=k % 2 == 0) for k in range(CANDIDATES)]
+        poses: list[Vector] = []
+        for k in range(CANDIDATES):
+            tilt, second, third = random.uniform([20.0, -60.0, -60.0], [90.0, 60.0, 60.0])
+            first = random.choice([-1.0, 1.0]) * tilt + (180.0 if k % 2 else 0.0)
+            # Rounded as a person would set them [deg].
+            poses.append((round(first, 1), round(second, 1), round(third, 1)))
         found, growth = motion.simulate(poses, samples, progress=progress)
         if not chosen:
             growth[:2] = 0.0  # training windows are too short for errors of their start to matter
@@ -171,13 +174,6 @@ def held_out(comparison: Comparison) -> pd.DataFrame:
     }
     table = pd.DataFrame.from_dict(median, orient="index", columns=columns).rename_axis("model")
     return pd.concat({"median": table, "pooled": comparison.table()}, axis=1)
-
-
-def _pose(random: np.random.Generator, upright: bool) -> Vector:
-    """Joint angles [deg] of a release, rounded to 0.1 as a person would set them."""
-    tilt, second, third = random.uniform([20.0, -60.0, -60.0], [90.0, 60.0, 60.0])
-    first = random.choice([-1.0, 1.0]) * tilt + (0.0 if upright else 180.0)
-    return round(first, 1), round(second, 1), round(third, 1)
 
 
 class _Motion:
@@ -274,17 +270,14 @@ class _Motion:
             growth = np.maximum(growth, np.abs(q[:, count:] - q[:, :count]).max(axis=0))
             now = (q, _joint(state[1]), _joint(change[1]), torque)
             kept[sample] = [part[:, :count] for part in now]
-            state = self._step(state, change, step)
+            # One classical Runge-Kutta step.
+            second, _ = self.rates(state + 0.5 * step * change)
+            third, _ = self.rates(state + 0.5 * step * second)
+            fourth, _ = self.rates(state + step * third)
+            state = state + step / 6.0 * (change + 2.0 * (second + third) + fourth)
         # Releases first, with the samples of each contiguous.
         parts = np.ascontiguousarray(kept.transpose(3, 1, 0, 2))
         return [TrueMotion(*of) for of in parts], growth
-
-    def _step(self, state: Array, first: Array, step: float) -> Array:
-        """One classical Runge-Kutta step, given the derivative at its start."""
-        second, _ = self.rates(state + 0.5 * step * first)
-        third, _ = self.rates(state + 0.5 * step * second)
-        fourth, _ = self.rates(state + step * third)
-        return state + step / 6.0 * (first + 2.0 * (second + third) + fourth)
 
 
 def _joint(absolute: Array) -> Array:
