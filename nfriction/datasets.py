@@ -62,18 +62,14 @@ def load(
     # The first process builds, others wait for it.
     with FileLock(f"{folder}.lock"):
         if not folder.exists():
-            _build(name, folder, truth, seed, duration)
+            # Files are put in place together.
+            with TemporaryDirectory(dir=parent) as aside:
+                unfinished = Path(aside) / "files"
+                if name == CONTROLLER:
+                    build_samples(unfinished, seed=seed, duration=duration)
+                elif name == FAMILY:
+                    family.build(truth, unfinished, seed=seed, duration=duration or family.DURATION)
+                else:
+                    twin.build(own, unfinished, seed=seed, duration=duration)
+                unfinished.rename(folder)
     return read_samples(folder) if name == CONTROLLER else read(name_in_twin, folder)
-
-
-def _build(name: str, folder: Path, truth: str, seed: int, duration: float | None) -> None:
-    """Write a data set's files and put them in place together."""
-    with TemporaryDirectory(dir=folder.parent) as parent:
-        unfinished = Path(parent) / "files"
-        if name == CONTROLLER:
-            build_samples(unfinished, seed=seed, duration=duration)
-        elif name == FAMILY:
-            family.build(truth, unfinished, seed=seed, duration=duration or family.DURATION)
-        else:
-            twin.build(name.removesuffix("_twin"), unfinished, seed=seed, duration=duration)
-        unfinished.rename(folder)

@@ -142,21 +142,8 @@ def _write_controller(
         return
     name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
     name = arguments.name or (name if is_identifier(name) else f"nf_{name[:21]}")
-    _prove(export.c(model, arguments.out, info, name=name, **options)[0], model, info)
-    if arguments.online:
-        from nfriction.papers.nffem.online import OnlineOptions, write_online
-
-        learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
-        write_online(model, arguments.out, learning, name=f"{name}_online")
-
-
-def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
-    """Run exported C on this machine and compare it with the model, or print why that failed.
-
-    The other targets are compared when they are written.
-    """
-    from nfriction import export
-
+    source = export.c(model, arguments.out, info, name=name, **options)[0]
+    # The other targets are compared when they are written.
     try:
         verdict = export.verify_artefact(source, model, info, points=1000)
     except export.ExportError as error:
@@ -167,6 +154,11 @@ def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
             raise export.ExportError(
                 f"{source.name} differs from its model and was not written: {verdict.points}."
             )
+    if arguments.online:
+        from nfriction.papers.nffem.online import OnlineOptions, write_online
+
+        learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
+        write_online(model, arguments.out, learning, name=f"{name}_online")
 
 
 def _write_simulator(

@@ -1,7 +1,7 @@
 """`nfriction info`, `report` and `data`: model files, folders of comparisons, public recordings."""
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,19 +90,15 @@ def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str
     if info.training_data:
         yield "trained on", ", ".join(info.training_data)
     if "status" in info.fit:
-        yield "fit", _fit(info.fit, info.unit)
+        said = str(info.fit["status"]).rstrip(".")
+        residual, bounds = info.fit.get("residual"), info.fit.get("at_bounds")
+        if isinstance(residual, float):
+            said += f", {1e3 * residual:.3g} m{info.unit} over the training windows"
+        if isinstance(bounds, list) and bounds:
+            said += f"; at a bound: {', '.join(map(str, bounds))}"
+        yield "fit", said
     if info.rating:
         yield "rating", info.rating
-
-
-def _fit(fit: Mapping[str, object], unit: str) -> str:
-    said = str(fit["status"]).rstrip(".")
-    residual, bounds = fit.get("residual"), fit.get("at_bounds")
-    if isinstance(residual, float):
-        said += f", {1e3 * residual:.3g} m{unit} over the training windows"
-    if isinstance(bounds, list) and bounds:
-        said += f"; at a bound: {', '.join(map(str, bounds))}"
-    return said
 
 
 def add_data(commands: Commands) -> None:

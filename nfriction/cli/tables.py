@@ -76,11 +76,6 @@ def verdict(comparison: Comparison) -> str:
         return "no verdict: there was no test recording; give some with --test"
     if best is None:
         return "no verdict: every free run over the test recordings diverged"
-    unfit = "".join(f"\nnot fit for use: {name}: {why}" for name, why in comparison.unfit().items())
-    return _best(comparison, best) + unfit
-
-
-def _best(comparison: Comparison, best: str) -> str:
     over = comparison.judged_over()
     error = 1e3 * comparison.table(over)["all"][best]
     run = f"windows of {over} s, as the free run is chaotic," if over else "free run"
@@ -91,15 +86,16 @@ def _best(comparison: Comparison, best: str) -> str:
     )
     tied, limit = comparison.indistinguishable(), comparison.limit(over)
     # Without a limit no difference can be called insignificant.
-    if len(tied) < 2 or limit is None:
-        return found
-    rated = {n: f" ({comparison.rating(n)[0]})" for n in comparison.fits}
-    others = ", ".join(f"{name}{rated.get(name, '')}" for name in tied if name != best)
-    return (
-        f"{found}\nstatistically tied with {others} (differences below the limit of these data, "
-        f"{1e3 * limit:.3g} m{comparison.unit}, are not meaningful); the simplest of them is "
-        f"{tied[0]}"
-    )
+    if len(tied) > 1 and limit is not None:
+        rated = {n: f" ({comparison.rating(n)[0]})" for n in comparison.fits}
+        others = ", ".join(f"{name}{rated.get(name, '')}" for name in tied if name != best)
+        found += (
+            f"\nstatistically tied with {others} (differences below the limit of these data, "
+            f"{1e3 * limit:.3g} m{comparison.unit}, are not meaningful); the simplest of them is "
+            f"{tied[0]}"
+        )
+    unfit = comparison.unfit().items()
+    return found + "".join(f"\nnot fit for use: {name}: {why}" for name, why in unfit)
 
 
 def coefficient_table(model: FrictionModel, joint_names: Sequence[str], unit: str) -> str:

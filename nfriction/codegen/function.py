@@ -49,22 +49,19 @@ class CompiledFunction:
         program = self._module.trace(inputs)
         self._inputs = {p.name: p.shape for p in program.inputs if p.name in inputs}
         key = program.digest(), self._jacobian
-        known = _known.get(key)
-        self.kernel, self._outputs = known or self._built(program)
-        if known is None:
+        if key in _known:
+            self.kernel, self._outputs = _known[key]
+        else:
+            if self._jacobian:
+                program = with_jacobian(program, [f"x{i}" for i in self._jacobian])
+            self._outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
+            layout = batch.Layout(tuple(self._inputs), tuple(self._outputs))
+            self.kernel = batch.Kernel(lambda width: _driver(program, layout, width), layout)
             self.check(example_inputs)
         _known[key] = self.kernel, self._outputs
         _known.move_to_end(key)
         if len(_known) > _KEPT:
             _known.popitem(last=False)
-
-    def _built(self, program: Program) -> tuple[batch.Kernel, dict[str, tuple[int, ...]]]:
-        """The kernel of a traced function, and the shapes of its outputs."""
-        if self._jacobian:
-            program = with_jacobian(program, [f"x{i}" for i in self._jacobian])
-        outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
-        layout = batch.Layout(tuple(self._inputs), tuple(outputs))
-        return batch.Kernel(lambda width: _driver(program, layout, width), layout), outputs
 
     def __call__(self, *inputs: Any) -> Any:
         """Evaluate row by row: an array (batch, *shape), or a tuple of them if there are several.

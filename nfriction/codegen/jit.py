@@ -64,9 +64,10 @@ def build(source: str, name: str) -> Callable[..., None]:
     Args:
         name: of the function, which returns nothing.
     """
-    from llvmlite import binding as llvm  # slow to import
+    from llvmlite import __version__  # slow to import
+    from llvmlite import binding as llvm
 
-    recipe = (source, llvm.get_process_triple(), *_processor(), _version(), str(EFFORT))
+    recipe = (source, llvm.get_process_triple(), *_processor(), __version__, str(EFFORT))
     key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
     folder = None
     try:
@@ -78,7 +79,12 @@ def build(source: str, name: str) -> Callable[..., None]:
         code = _compile(source)
         if folder:
             _keep(folder, key, code)
-    _find_library(llvm)
+    if sys.platform == "win32":
+        # Functions that LLVM does not find there; a missing one ends the process.
+        for library, names in (("ucrtbase", LIBRARY), ("ntdll", ("__chkstk",))):
+            for each in names:
+                address = ctypes.cast(ctypes.CDLL(library)[each], ctypes.c_void_p).value
+                llvm.add_symbol(each, address)
     # The engine also owns the target machine, so each engine has its own.
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -90,15 +96,6 @@ def build(source: str, name: str) -> Callable[..., None]:
         function(*given)
 
     return call
-
-
-def _find_library(llvm: Any) -> None:
-    """Register functions that LLVM does not find on Windows; a missing one ends the process."""
-    if sys.platform == "win32":
-        for library, names in (("ucrtbase", LIBRARY), ("ntdll", ("__chkstk",))):
-            for name in names:
-                function = ctypes.CDLL(library)[name]
-                llvm.add_symbol(name, ctypes.cast(function, ctypes.c_void_p).value)
 
 
 @cache
@@ -137,13 +134,6 @@ def _keep(folder: Path, key: str, code: bytes) -> None:
 
 def _digest(code: bytes) -> str:
     return hashlib.sha256(code).hexdigest()[:32]
-
-
-@cache
-def _version() -> str:
-    from llvmlite import __version__
-
-    return str(__version__)
 
 
 @cache

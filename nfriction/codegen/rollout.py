@@ -118,18 +118,14 @@ class RolloutDriver(Driver):
                  "alive": 1}  # fmt: skip
         super().__init__(LAYOUT, width, sizes, program.once, program.places)
         self.program = program
-        self._functions()
+        self.function("nf_start", ["state", "tau"], {"rate": program.start}, seldom=True)
+        self.function("nf_held", ["seen", "memory"], {"held": program.held})
+        self.function("nf_begin", ["seen"], {"memory": program.begin}, seldom=True)
+        self.function("nf_advance", ["seen", "memory"], {"memory": program.advance})
+        after = {"state": program.step, "within": (program.within,)}
+        self.function("nf_step", ["state", "tau", "step", "held"], after)
         with self.entry():
             self._candidates()
-
-    def _functions(self) -> None:
-        parts, function = self.program, self.function
-        function("nf_start", ["state", "tau"], {"rate": parts.start}, seldom=True)
-        function("nf_held", ["seen", "memory"], {"held": parts.held})
-        function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
-        function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
-        after = {"state": parts.step, "within": (parts.within,)}
-        function("nf_step", ["state", "tau", "step", "held"], after)
 
     def _candidates(self) -> None:
         """Write the code for candidates that are computed together."""

@@ -180,7 +180,12 @@ class _Walk:
         elif kind is types.ModuleType and _is_constant(value.__name__):
             self.parts.append(value.__name__)
         else:
-            self._object(kind, value)
+            # An object of a Python class: its class and all of its attributes.
+            python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
+            if not python or kind.__basicsize__ > _PLAIN_SIZE or not hasattr(value, "__dict__"):
+                raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")
+            self._class(kind)
+            self._mapping(vars(value))
 
     def _length(self, length: int) -> None:
         self.parts.append(length)
@@ -267,14 +272,6 @@ class _Walk:
                     if not given or isinstance(value, types.FunctionType):
                         self.parts.append(name)
                         self.add(value)
-
-    def _object(self, kind: type, value: Any) -> None:
-        """Follow an object of a Python class: its class and all of its attributes."""
-        python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
-        if not python or kind.__basicsize__ > _PLAIN_SIZE or not hasattr(value, "__dict__"):
-            raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")
-        self._class(kind)
-        self._mapping(vars(value))
 
 
 def _home(function: Any) -> str:

@@ -160,7 +160,12 @@ def write_results(
             for name, fit in comparison.fits.items():
                 info = model_info(fit, train, run)
                 info = replace(info, fit={**info.fit, "usability": comparison.rating(name)})
-                paths = _write_model(fit, unfinished / "models" / f"{name}.json", info)
+                paths = [save(fit.model, unfinished / "models" / f"{name}.json", info)]
+                try:
+                    paths.append(torchscript(fit.model, paths[0].with_suffix(".pt"), info))
+                # ValueError: a memory that no controller can follow, or not at this sample time.
+                except (ExportError, ValueError) as error:
+                    logger.warning("%s was not exported: %s", name, " ".join(str(error).split()))
                 written += [f"models/{path.name}" for path in paths]
             write_index(unfinished, written)
             unfinished.rename(folder / COMPLETE)
@@ -256,14 +261,3 @@ def _plain_cell(name: str) -> str:
     # Spreadsheets also accept full-width signs, and skip white space before them.
     start = unicodedata.normalize("NFKC", text.lstrip())[:1]
     return f"'{text}" if start in tuple("=+-@") else text
-
-
-def _write_model(fit: FitResult, path: Path, info: ModelInfo) -> list[Path]:
-    """Write the model file, and TorchScript if the model can be exported."""
-    written = [save(fit.model, path, info)]
-    try:
-        written.append(torchscript(fit.model, path.with_suffix(".pt"), info))
-    # ValueError: a law with memory that no controller can follow, or not at these sample times.
-    except (ExportError, ValueError) as error:
-        logger.warning("%s was not exported: %s", path.stem, " ".join(str(error).split()))
-    return written

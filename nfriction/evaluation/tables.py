@@ -90,24 +90,18 @@ class Table:
         ]
         if self.limit:
             lines.append(tuple(self.text(value) for value in self.limit))
-        lines = _room_for_marks(lines)
+        # Unmarked entries reserve space for a mark, so that digits are aligned.
+        marked = [any(v.endswith("=") for v in column) for column in zip(*lines, strict=True)]
+        lines = [
+            tuple(v + " " * (room and not v.endswith("="))
+                  for v, room in zip(line, marked, strict=True))
+            for line in lines
+        ]  # fmt: skip
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         just = [str.rjust if self.is_numeric(k) else str.ljust for k in range(len(widths))]
         printed = ("  ".join(j(v, w) for j, v, w in zip(just, line, widths, strict=True))
                    for line in lines)  # fmt: skip
         return "\n".join([self.caption, *(line.rstrip() for line in printed)])
-
-
-def _room_for_marks(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Lines whose unmarked entries reserve space for a mark, so that digits are aligned."""
-    marked = [any(value.endswith("=") for value in column) for column in zip(*lines, strict=True)]
-    return [
-        tuple(
-            value + " " * (room and not value.endswith("="))
-            for value, room in zip(line, marked, strict=True)
-        )
-        for line in lines
-    ]
 
 
 def error_table(comparison: Comparison, part: Part) -> Table:

@@ -26,7 +26,7 @@ from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, TERMS, Recorded, unus
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
-from nfriction.recording import Unit
+from nfriction.recording import Array, Unit
 from nfriction.recording.torque_table import (
     MINIMUM_ROWS,
     JointTorque,
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 logger = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 FOLDS = 10
 # Laws that are fitted by default: to any table, and to those with columns time, load or both.
@@ -463,7 +461,10 @@ def _cause(
     Returns:
         A sentence, empty if there is none, and the cause's torque (row,) [N m; N].
     """
-    odd, parts = _odd_terms(joint), blocks(joint, min(FOLDS, len(joint)))
+    # Torques that reverse with the velocity, (row, term): a coarse law of any shape.
+    speed, load = np.abs(joint.qd), [] if joint.load is None else [joint.load]
+    odd = np.sign(joint.qd)[:, None] * np.stack([speed**0, speed, np.sqrt(speed), *load], 1)
+    parts = blocks(joint, min(FOLDS, len(joint)))
     one, way = np.ones_like(torque), np.sign(joint.qd) * torque
     given = np.stack([joint.tau - torque, one, way, joint.qdd], 1)
     # Without the part that a law of the velocity may explain, whatever its shape.
@@ -497,13 +498,6 @@ def _cause(
     # In a narrow range of torques, an offset and a direction are alike.
     alike = best < 2 and not improves(left[best], left[1 - best], chance)
     return texts[best] + f" Or, explaining as much: {texts[1 - best]}" * alike, found
-
-
-def _odd_terms(joint: JointTorque) -> Array:
-    """Torques that reverse with the velocity, (row, term): a coarse law of any shape."""
-    speed = np.abs(joint.qd)
-    load = [] if joint.load is None else [joint.load]
-    return np.sign(joint.qd)[:, None] * np.stack([speed**0, speed, np.sqrt(speed), *load], 1)
 
 
 def _left_out(error: Array, cause: Array, parts: Sequence[NDArray[np.intp]]) -> torch.Tensor:

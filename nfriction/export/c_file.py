@@ -18,6 +18,7 @@ from nfriction.export.c_dialect import ControllerC, Real, is_identifier
 from nfriction.export.c_model import source_of
 from nfriction.export.contract import (
     COEFFICIENT_SLACK,
+    LARGEST_FILE,
     Contract,
     ContractError,
     ExportError,
@@ -80,10 +81,17 @@ def c(
     contract = contract_of(model, controller, info, dtype=dtype)
     dialect = ControllerC(REALS[dtype], name)
     plant = None if info is None or info.rig is None else from_dict(info.rig)
-    code, header = source_of(controller, contract.description, dialect, name, plant)
-    words = _words(contract, name)
+    about = contract.description
+    code, header = source_of(controller, about, dialect, name, plant)
+    words = {
+        "name": name,
+        "title": f"Friction of {about['joints']} joint" + "s" * (about["joints"] > 1),
+        "unit": str(about["unit"]),
+        "torque_unit": str(about["units"]["tau_f"]),
+        "period": str(max(1, round(1e6 * (about["sample_time"] or 1e-3)))),
+    }
     # A hidden state advances by one sample in every call, also in minor steps of a solver.
-    held = contract.description["sample_time"] if controller.memory_size else None
+    held = about["sample_time"] if controller.memory_size else None
     files = {
         f"{name}.c": code,
         f"{name}.h": header,
@@ -95,18 +103,6 @@ def c(
     }
     return [write_atomically(Path(folder) / key, text.encode("ascii"))
             for key, text in files.items()]  # fmt: skip
-
-
-def _words(contract: Contract, name: str) -> dict[str, str]:
-    description = contract.description
-    sample_time = description["sample_time"] or 1e-3
-    return {
-        "name": name,
-        "title": f"Friction of {description['joints']} joint" + "s" * (description["joints"] > 1),
-        "unit": str(description["unit"]),
-        "torque_unit": str(description["units"]["tau_f"]),
-        "period": str(max(1, round(1e6 * sample_time))),
-    }
 
 
 def _vectors(contract: Contract, dialect: ControllerC) -> dict[str, str]:
@@ -149,7 +145,6 @@ def _table(name: str, values: Tensor, dialect: ControllerC, kind: str = "") -> s
 
 # Usual flags for controllers; standard-conforming, because fast-math is the user's choice.
 FLAGS = ("-std=c89", "-O2")
-LARGEST_FILE = 256 * 2**20
 
 
 def find_compiler() -> list[str] | None:

@@ -74,7 +74,16 @@ def trials(controller: Controller) -> Series:
     """
     drawn = draw(controller, 200, seed=6)
     if not controller.filters:
-        special = _special(controller)
+        # All pairs of edges of the range, rest, and creeping.
+        levels = []
+        for edges in ranges(controller).values():
+            low, high = edges.unbind(-1)
+            zero, tiny = torch.zeros_like(low), 1e-4 * high.abs()
+            levels.append(torch.stack([low, high, zero, -zero, tiny, -tiny]))
+        qd = levels[0].repeat_interleave(len(levels[1]), 0)
+        load = torch.ones_like(qd)
+        load[::2] = 0.0
+        special = qd, levels[1].repeat(len(levels[0]), 1), load
         drawn = tuple(torch.cat(pair) for pair in zip(drawn, special, strict=True))
     return _with_broken(drawn, controller.joints)
 
@@ -97,22 +106,6 @@ def _sweep(controller: Controller, count: int) -> Tensor:
     phase = torch.arange(controller.joints, dtype=torch.float64)
     growth = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None]
     return 1.2 * growth * fastest.abs() / rate * torch.sin(rate * time + phase)
-
-
-def _special(controller: Controller) -> Series:
-    """All pairs of edges of the range, rest, and creeping."""
-    found = ranges(controller)
-    levels = {}
-    for name, edges in found.items():
-        low, high = edges.unbind(-1)
-        zero = torch.zeros_like(low)
-        tiny = 1e-4 * high.abs()
-        levels[name] = torch.stack([low, high, zero, -zero, tiny, -tiny])
-    qd = levels["qd"].repeat_interleave(len(levels["qdd"]), 0)
-    qdd = levels["qdd"].repeat(len(levels["qd"]), 1)
-    load = torch.ones_like(qd)
-    load[::2] = 0.0
-    return qd, qdd, load
 
 
 def _with_broken(inputs: Series, joints: int) -> Series:
@@ -149,7 +142,7 @@ TOLERANCE = {"float64": 1e-12, "float32": 5e-7}
 # Coefficients result from longer sums than the torque, some of them small differences.
 COEFFICIENT_SLACK = 20.0
 OUTPUTS = ("tau_f", "coefficients", "status")
-MOST_VECTORS, MOST_STATES = 100_000, 1000
+MOST_VECTORS, MOST_STATES, LARGEST_FILE = 100_000, 1000, 256 * 2**20
 
 Runner = Callable[..., Sequence[Any]]
 

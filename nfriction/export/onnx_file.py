@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from nfriction.export.contract import (
+    LARGEST_FILE,
     OUTPUTS,
     Contract,
     ExportError,
@@ -33,7 +34,6 @@ from nfriction.version import __version__
 
 # Old enough for runtimes in use; nothing newer is needed.
 OPSET, IR_VERSION = 18, 8
-LARGEST_FILE = 256 * 2**20
 REAL = {"float64": np.float64, "float32": np.float32}
 
 
@@ -66,12 +66,18 @@ class OnnxGraph:
         self.nodes: list[Any] = []
         self.constants: dict[str, np.ndarray] = {}
         self._known: dict[tuple[Any, ...], str] = {}
-        owned = _owned(program)
+        # Parameters, buffers and constants, by the name of their placeholder.
+        signature, held = program.graph_signature, {**program.state_dict, **program.constants}
+        owned = {
+            **signature.inputs_to_parameters,
+            **signature.inputs_to_buffers,
+            **signature.inputs_to_lifted_tensor_constants,
+        }
         values: dict[Any, Any] = {}
         names = iter(inputs)
         for node in program.graph.nodes:
             if node.op == "placeholder" and node.name in owned:
-                values[node] = owned[node.name]
+                values[node] = held[owned[node.name]].detach()
             elif node.op == "placeholder":
                 values[node] = Value(next(names), torch.float64)
             elif node.op == "call_function":
@@ -119,18 +125,6 @@ class OnnxGraph:
                 "TorchScript, C or torch.export instead."
             )
         return rule(self, *args, **kwargs)
-
-
-def _owned(program: torch.export.ExportedProgram) -> dict[str, Tensor]:
-    """Parameters, buffers and constants, by the name of their placeholder."""
-    signature = program.graph_signature
-    held = {**program.state_dict, **program.constants}
-    placeholders = {
-        **signature.inputs_to_parameters,
-        **signature.inputs_to_buffers,
-        **signature.inputs_to_lifted_tensor_constants,
-    }
-    return {name: held[target].detach() for name, target in placeholders.items()}
 
 
 # Rules: the arguments are those of the ATen operation.

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export.contract import (
+    LARGEST_FILE,
     Contract,
     ExportError,
     Runner,
@@ -36,7 +37,6 @@ from nfriction.version import __version__
 
 # Name of the metadata in an artefact.
 METADATA = "nfriction.json"
-LARGEST = 256 * 2**20
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError,
             ValueError, LookupError, OverflowError)  # fmt: skip
 # Files of plain numbers, and files that may differ for one program: metadata and line numbers.
@@ -86,8 +86,16 @@ def torchscript(
     def runner(path: Path) -> Runner:
         with silent():
             module = torch.jit.load(str(path))
-        if not controller.remembers:
-            _check_torque(controller, module, contract)
+        if not controller.remembers:  # then it also has a `forward`
+            inputs = draw_motion(controller, 1000)
+            with torch.no_grad():
+                expected, got = controller.torque(*inputs), module(*inputs)
+            scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"])
+            error = float(((got - expected).abs() / scale.clamp_min(1e-300)).max())
+            if not error <= contract.tolerance:
+                raise ExportError(
+                    f"the TorchScript differs from its model by {error:.1e} of full scale."
+                )
         return _script_runner(module, controller)
 
     content = _script(controller, contract.to_json())
@@ -100,17 +108,6 @@ def _script(controller: Controller, metadata: str) -> bytes:
     with silent():
         torch.jit.save(_compile(controller), buffer, _extra_files={METADATA: metadata})
     return buffer.getvalue()
-
-
-@torch.no_grad()
-def _check_torque(controller: Controller, module: Any, contract: Contract) -> None:
-    """Refuse a TorchScript whose `forward` differs from the model."""
-    inputs = draw_motion(controller, 1000)
-    expected, got = controller.torque(*inputs), module(*inputs)
-    scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)
-    error = float(((got - expected).abs() / scale).max())
-    if not error <= contract.tolerance:
-        raise ExportError(f"the TorchScript differs from its model by {error:.1e} of full scale.")
 
 
 def _script_runner(module: Any, controller: Controller) -> Runner:
@@ -233,7 +230,8 @@ def pt2(
     def runner(path: Path) -> Runner:
         # As bytes, because torch warns of files with another ending, such as the temporary one.
         with silent():
-            return _program_runner(torch.export.load(io.BytesIO(path.read_bytes())), controller)
+            program = torch.export.load(io.BytesIO(path.read_bytes())).module()
+        return lambda *x: run_from_nan(program, x, controller.state_size)
 
     content = _program(controller, contract.to_json())
     return write_verified(path, content, contract, runner, "program")
@@ -256,23 +254,14 @@ def _program(controller: Controller, metadata: str) -> bytes:
     return buffer.getvalue()
 
 
-def _program_runner(program: torch.export.ExportedProgram, controller: Controller) -> Runner:
-    module = program.module()
-
-    @torch.no_grad()
-    def run(*inputs: Tensor) -> tuple[Any, ...]:
-        return run_from_nan(module, inputs, controller.state_size)
-
-    return run
-
-
 def program_runner(path: str | Path, controller: Controller) -> Runner:
     """Load a `.pt2` with the controller's program; its numbers may differ."""
     with silent():
-        program = torch.export.load(own_program(path, _program(controller, "")))
-        return _program_runner(program, controller)
+        program = torch.export.load(own_program(path, _program(controller, ""))).module()
+    return lambda *x: run_from_nan(program, x, controller.state_size)
 
 
+@torch.no_grad()
 def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:
     """Run a program over samples (sample, joint) in order; its state, if any, starts as NaN."""
     if not state_size:
@@ -383,11 +372,11 @@ def _contents(path: str | Path, source: str | Path | IO[bytes]) -> dict[str, byt
     found: dict[str, bytes] = {}
     known: set[str] = set()
     try:
-        if Path(path).stat().st_size > LARGEST:
+        if Path(path).stat().st_size > LARGEST_FILE:
             raise ExportError(f"{path}: too large for an artefact of nfriction.")
         with zipfile.ZipFile(source) as archive:
             entries = archive.infolist()
-            if sum(max(entry.file_size, entry.compress_size) for entry in entries) > LARGEST:
+            if sum(max(entry.file_size, entry.compress_size) for entry in entries) > LARGEST_FILE:
                 raise ExportError(f"{path}: too large for an artefact of nfriction.")
             for entry in entries:
                 name = entry.filename.partition("/")[2]

@@ -203,14 +203,26 @@ class RBFNetwork(grouped.LinearOutputModule):
     def init_kmeans(self, x: Tensor, seed: int = 0) -> None:
         """Place centres by k-means; widths are twice the mean distance to the two nearest centres.
 
+        Distances are in units of each input's standard deviation.
+
         Args:
             x: samples, shape (*batch, groups, inputs).
         """
-        samples = self._samples(x)
-        for group in range(self.groups):
-            centres = _kmeans(samples[:, group], self.units, seed)
-            self.centres[group] = centres
-            self.log_widths[group] = _nearest_spread(centres, samples[:, group]).log()
+        from scipy.cluster.vq import kmeans2  # slow to import and rarely needed
+
+        for group, own in enumerate(self._samples(x).unbind(1)):
+            # k-means depends on the units of its inputs.
+            scale = own.std(0)
+            given = (own / scale).cpu().numpy()
+            found, _ = kmeans2(given, self.units, iter=50, minit="++", seed=seed)
+            self.centres[group] = centres = torch.as_tensor(found).to(own) * scale
+            spread = torch.ones(1, 1).to(scale)
+            if self.units > 1:
+                distance = torch.cdist(centres / scale, centres / scale)
+                # The smallest distance is that from a centre to itself.
+                spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
+            # Two centres may coincide if k-means had too few distinct samples.
+            self.log_widths[group] = (2 * spread.clamp(min=1e-3) * scale).log()
 
     @torch.no_grad()
     def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
@@ -320,31 +332,6 @@ class AnfisRBF(nn.Module):
         # On the residual, so that the rules keep their meaning.
         left = grouped.targets_of(x, y, self.outputs).view_as(carried) - carried
         self.head.solve_output(torch.cat([x, carried], -1), left, prior_precision)
-
-
-def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
-    """Centres of `units` clusters, shape (units, inputs), inputs scaled by their deviation."""
-    from scipy.cluster.vq import kmeans2  # slow to import and rarely needed
-
-    # k-means depends on the units of its inputs.
-    scale = samples.std(0)
-    centres, _ = kmeans2((samples / scale).cpu().numpy(), units, iter=50, minit="++", seed=seed)
-    return torch.as_tensor(centres).to(samples) * scale
-
-
-def _nearest_spread(centres: Tensor, samples: Tensor) -> Tensor:
-    """Widths twice the mean distance to the two nearest other centres, (units, inputs).
-
-    Distances are in units of each input's standard deviation.
-    """
-    scale = samples.std(0)
-    if len(centres) == 1:
-        return 2 * scale.expand_as(centres)
-    distance = torch.cdist(centres / scale, centres / scale)
-    # The smallest distance is that from a centre to itself.
-    spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
-    # Two centres may coincide if k-means had too few distinct samples.
-    return 2 * spread.clamp(min=1e-3) * scale
 
 
 def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> Tensor:

@@ -34,7 +34,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise OSError(error.errno, _message(error, path), str(path)) from error
+        remedy = ""
+        if error.errno in _FULL:
+            remedy = f"; make room in {path.parent}, or write to another folder"
+        elif error.errno in _REFUSED:
+            remedy = f"; allow writing to {path.parent}, or write to another folder"
+        message = f"cannot write the file ({error.strerror or error}{remedy})"
+        raise OSError(error.errno, message, str(path)) from error
     finally:
         with suppress(OSError):  # the folder may be gone or read-only by now
             temporary.unlink()
@@ -45,15 +51,6 @@ def write_atomically(path: str | Path, content: bytes) -> Path:
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
     return Path(path)
-
-
-def _message(error: OSError, path: Path) -> str:
-    remedy = ""
-    if error.errno in _FULL:
-        remedy = f"; make room in {path.parent}, or write to another folder"
-    elif error.errno in _REFUSED:
-        remedy = f"; allow writing to {path.parent}, or write to another folder"
-    return f"cannot write the file ({error.strerror or error}{remedy})"
 
 
 def parse_json(

@@ -321,7 +321,14 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
             raise ValueError("the checksum does not match; damaged or edited.")
         _check_sizes(content, size)
         check_joints(_info(content), content["joints"])
-        _check_depth([v for k, v in content.items() if k != "state"])
+        # Content nested more deeply could not be copied and written again.
+        inside = [v for k, v in content.items() if k != "state"]
+        for _ in range(DEEPEST):
+            nested = [v.values() if isinstance(v, dict) else v
+                      for v in inside if isinstance(v, (dict, list))]  # fmt: skip
+            inside = [value for part in nested for value in part]
+        if inside:
+            raise ValueError("nested too deeply for a model file.")
     return content
 
 
@@ -386,16 +393,6 @@ def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
             f"{tuple(value.shape)}."
         )
     return value
-
-
-def _check_depth(content: list[Any]) -> None:
-    """Refuse content nested too deeply to be copied and written again."""
-    for _ in range(DEEPEST):
-        nested = [value for value in content if isinstance(value, (dict, list))]
-        parts = [v.values() if isinstance(v, dict) else v for v in nested]
-        content = [value for part in parts for value in part]
-    if content:
-        raise ValueError("nested too deeply for a model file.")
 
 
 def _check_sizes(content: Mapping[str, Any], size: int) -> None:

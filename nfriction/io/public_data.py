@@ -80,7 +80,15 @@ def fetch(name: str, folder: Path) -> Fetched:
     for recording, (original, digest) in chosen.recordings.items():
         path, address = folder / "originals" / original, chosen.address(original)
         if not path.exists():
-            _download(address, path)
+            try:
+                with urllib.request.urlopen(address, timeout=60) as answer:
+                    content = answer.read()
+            except (OSError, http.client.HTTPException) as error:
+                raise OSError(
+                    f"cannot fetch {address} ({error}); fetch it where there is a network, save it "
+                    f"as '{path}' and repeat the command."
+                ) from error
+            write_atomically(path, content)
         try:
             table, state = _CONVERT[chosen.source](path, recording)
         except _NOT_IT as error:
@@ -88,7 +96,13 @@ def fetch(name: str, folder: Path) -> Fetched:
                 f"'{path}' is not what {address} contains ({type(error).__name__}: {error}); "
                 "delete it and fetch it again."
             ) from error
-        text = _csv(table, chosen.digits)
+        columns = {}
+        for column, values in table.items():
+            # By the longest matching prefix of the column's name.
+            known = (key for key in chosen.digits if str(column).startswith(key))
+            form = chosen.digits[max(known, key=len)]
+            columns[column] = [form % value for value in values]
+        text = pd.DataFrame(columns).to_csv(index=False, lineterminator="\n").encode()
         if hashlib.sha256(text).hexdigest() != digest:
             differing.append(recording)
         tables.append(folder / f"{recording}.csv.gz")
@@ -97,27 +111,6 @@ def fetch(name: str, folder: Path) -> Fetched:
     states = pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
     write_atomically(folder / "recordings.csv", states.encode())
     return Fetched(tuple(tables), tuple(differing))
-
-
-def _download(address: str, path: Path) -> None:
-    try:
-        with urllib.request.urlopen(address, timeout=60) as answer:
-            content = answer.read()
-    except (OSError, http.client.HTTPException) as error:
-        raise OSError(
-            f"cannot fetch {address} ({error}); fetch it where there is a network, save it as "
-            f"'{path}' and repeat the command."
-        ) from error
-    write_atomically(path, content)
-
-
-def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:
-    """A table whose columns are formatted by the longest matching prefix of their names."""
-    columns = {}
-    for name, values in table.items():
-        form = digits[max((key for key in digits if str(name).startswith(key)), key=len)]
-        columns[name] = [form % value for value in values]
-    return pd.DataFrame(columns).to_csv(index=False, lineterminator="\n").encode()
 
 
 def _multiarm(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:

@@ -66,7 +66,12 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
             raise InvalidFile(refusal.read_text(encoding="utf-8", errors="replace"))
         if ended.returncode:
             errors.seek(max(0, errors.seek(0, os.SEEK_END) - 1000))
-            raise WorkerDied(_cause(ended.returncode, errors.read()))
+            lines = errors.read().decode(errors="replace").strip().splitlines()
+            cause = lines[-1][:200] if lines else f"exit status {ended.returncode}"
+            if ended.returncode < 0:
+                name = signal.Signals(-ended.returncode).name
+                cause = "it does not come to an end" if name == "SIGXCPU" else name
+            raise WorkerDied(cause)
 
 
 def worker_main(work: Callable[[Mapping[str, Any], Path], None], *, memory: int) -> None:
@@ -105,11 +110,3 @@ def _limit(seconds: float, memory: int) -> None:
         known = [x for x in (soft, hard) if x != resource.RLIM_INFINITY]
         with contextlib.suppress(ValueError, OSError):
             resource.setrlimit(kind, (min([bound, *known]), hard))
-
-
-def _cause(status: int, errors: bytes) -> str:
-    if status < 0:
-        name = signal.Signals(-status).name
-        return "it does not come to an end" if name == "SIGXCPU" else name
-    lines = errors.decode(errors="replace").strip().splitlines()
-    return lines[-1][:200] if lines else f"exit status {status}"

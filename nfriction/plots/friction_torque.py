@@ -11,27 +11,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.hysteresis import path_of
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
-from nfriction.fitting.torque_table import JointFit, predict
+from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name, plain_name
 from nfriction.friction.memory import load_at_rest
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import unit_for
 from nfriction.plant import Plant
 from nfriction.plots import style
-from nfriction.recording import Recording
-from nfriction.recording.torque_table import JointTorque
+from nfriction.recording import Array, Recording
 from nfriction.signals import Motion, kalman_smoother
 
 if TYPE_CHECKING:
     from nfriction.evaluation.torque_tables import TorqueFits
-
-Array = NDArray[np.float64]
 
 _POINTS = 3000  # drawn per joint
 _BINS = 24  # of velocity, for medians
@@ -217,7 +213,12 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
     """Torque over velocity; returns its unit."""
     joint = fits.table.joints[k]
     grid = velocities(joint.qd)
-    found = {name: _steady(fits.fits[name][k], joint, grid) for name, _ in lines}
+    velocity = torch.as_tensor(grid)
+    load = torch.full_like(velocity, 1.0 if joint.load is None else float(np.median(joint.load)))
+    found = {
+        name: [x.numpy() for x in fits.fits[name][k].steady(velocity, 0.0 * velocity, load)]
+        for name, _ in lines
+    }
     binned = _binned(joint.qd, joint.tau)
     extremes = np.concatenate([*binned[1:], *(line for line, _ in found.values())])
     factor, unit = style.scaled(fits.unit, extremes)
@@ -230,15 +231,6 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
     _medians(ax, binned, factor)
     ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.1))
     return unit
-
-
-def _steady(found: JointFit, joint: JointTorque, qd: Array) -> tuple[Array, Array]:
-    """Torque over velocity at the median load, and its standard deviation."""
-    load = 1.0 if joint.load is None else float(np.median(joint.load))
-    velocity = torch.as_tensor(qd)
-    zero = torch.zeros_like(velocity)
-    torque, sd = found.steady(velocity, zero, torch.full_like(velocity, load))
-    return torque.numpy(), sd.numpy()
 
 
 def _binned(qd: Array, tau: Array) -> Array:

@@ -299,7 +299,11 @@ def coefficient_sections(
     looks = style.looks(levels)
     for j, panels in enumerate(axes):
         edges = _edges(rules, j)
-        speed, accelerations = _middles(edges)[0], _levels(edges[1])
+        low, high = edges[1][[0, -1]].tolist()
+        middle, step = 0.5 * (low + high), 0.25 * (high - low)
+        if low < 0 < high:  # around zero if both signs occur
+            middle, step = 0.0, 0.5 * min(-low, high)
+        speed, accelerations = _middles(edges)[0], [middle - step, middle, middle + step]
         values, sd = on_grid(model, uncertainty, j, speed, np.array(accelerations))
         seen = np.ones((len(levels), CELLS), dtype=bool)
         if motions is not None:
@@ -344,15 +348,6 @@ def _edges(rules: FuzzyRules, joint: int) -> Edges:
 
 def _middles(edges: Edges) -> Edges:
     return 0.5 * (edges[0][1:] + edges[0][:-1]), 0.5 * (edges[1][1:] + edges[1][:-1])
-
-
-def _levels(edges: Array) -> list[float]:
-    """Three accelerations, around zero if both signs occur."""
-    low, high = float(edges[0]), float(edges[-1])
-    middle, step = 0.5 * (low + high), 0.25 * (high - low)
-    if low < 0 < high:
-        middle, step = 0.0, 0.5 * min(-low, high)
-    return [middle - step, middle, middle + step]
 
 
 def on_grid(

@@ -143,7 +143,17 @@ def read_run(folder: str | Path) -> Run:
     # From a file of another program with a matching checksum.
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RunError(f"{path}: not results of a comparison ({error!r:.200}).") from error
-    _require_one_run(run)
+    foreign = [
+        f"models/{name}.json"
+        for name, (_, info) in run.models.items()
+        if info.fit.get("run", "") != run.id
+    ]
+    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
+    if foreign:
+        raise RunError(
+            f"{folder} has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"results.json; run the comparison again, or give a folder that a single run wrote."
+        )
     return run
 
 
@@ -161,6 +171,13 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     fits = {name: FitRecord.of(entry["fit"]) for name, entry in entries.items() if "fit" in entry}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = _figures(folder / "figures")
+    selection = None
+    if (of := content.get("selection")) is not None:
+        candidates = tuple(
+            Candidate(name, tuple(map(_number, c["blocks"])), c["parameters"], c["converged"])
+            for name, c in of["candidates"].items()
+        )
+        selection = Selection(of["chosen"], of["reason"], candidates, of["horizon"], unit)
     comparison = Comparison(
         {}, scores["train"], scores["test"], unit, joints, failed=content.get("failed", {}),
         test_warnings=tuple(content.get("test_warnings", ())),
@@ -184,7 +201,7 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         models=models,
         figures=figures,
         notes=(*notes, *unread),
-        selection=_selection(content.get("selection"), unit),
+        selection=selection,
     )
 
 
@@ -208,16 +225,6 @@ def _score(recording: str, of: dict[str, Any]) -> Score:
         errors.free_run, errors.windows, of["limit"] and _errors(of["limit"]), recording,
         nothing, nothing, _number(of["diverged_at"]), zero,
     )  # fmt: skip
-
-
-def _selection(of: dict[str, Any] | None, unit: str) -> Selection | None:
-    if of is None:
-        return None
-    candidates = tuple(
-        Candidate(name, tuple(map(_number, c["blocks"])), c["parameters"], c["converged"])
-        for name, c in of["candidates"].items()
-    )
-    return Selection(of["chosen"], of["reason"], candidates, of["horizon"], unit)
 
 
 def _coefficients(of: dict[str, Any]) -> Coefficients:
@@ -268,18 +275,3 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
         run = _RUN.search(data[:4096])
         found.append(Figure(path.stem, data, width, height, run[1].decode() if run else ""))
     return tuple(found), notes
-
-
-def _require_one_run(run: Run) -> None:
-    """Refuse models and figures from another run than the results."""
-    foreign = [
-        f"models/{name}.json"
-        for name, (_, info) in run.models.items()
-        if info.fit.get("run", "") != run.id
-    ]
-    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
-    if foreign:
-        raise RunError(
-            f"{run.folder} has files of two runs: {', '.join(foreign)} belong to another run than "
-            f"results.json; run the comparison again, or give a folder that a single run wrote."
-        )

@@ -85,20 +85,6 @@ def integrate_compiled(
     None if compilation fails with `backend="auto"`, so that eager torch has to be used. Parameters
     of the friction model that replace its own are given by name, (*batch, *its shape).
     """
-    compiled = _compiled(system, backend, step_function)
-    if compiled is None:
-        return None
-    dims = inputs.q0.ndim - 1
-    values = {name: system.tensors[name].detach() for name in compiled.parameter_names}
-    for name, value in (parameters or {}).items():
-        values[f"friction.{name}"] = value.detach().reshape(-1, *value.shape[dims:])
-    return compiled(inputs, values, threads)
-
-
-def _compiled(
-    system: System, backend: Backend, step_function: StepFunction
-) -> "codegen.CompiledRollout | None":
-    """The compiled rollout of this system, from the cache if it is there."""
     plant, friction = system.plant, system.friction
     if not all(isinstance(m, nn.Module) for m in (plant, friction)):
         if backend == "auto":
@@ -112,16 +98,20 @@ def _compiled(
             "compiled rollouts are traced again in every call, because they may read "
             f"{system.fingerprint}"
         )
-        found = _attempt(plant, friction, step_function)
+        compiled = _attempt(plant, friction, step_function)
     else:
         key = system.fingerprint, step_function
-        found = _known.get(key) or _attempt(plant, friction, step_function)
-        _keep(_known, key, found)
-    if isinstance(found, codegen.CodegenError):
+        compiled = _known.get(key) or _attempt(plant, friction, step_function)
+        _keep(_known, key, compiled)
+    if isinstance(compiled, codegen.CodegenError):
         if backend != "auto":
-            raise found
+            raise compiled
         return None
-    return found
+    dims = inputs.q0.ndim - 1
+    values = {name: system.tensors[name].detach() for name in compiled.parameter_names}
+    for name, value in (parameters or {}).items():
+        values[f"friction.{name}"] = value.detach().reshape(-1, *value.shape[dims:])
+    return compiled(inputs, values, threads)
 
 
 def _attempt(

@@ -169,7 +169,18 @@ def read_mat(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
     if len(start) < _HEADER or start[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is not a MATLAB file of version 5 or 7.3")
     refuse_size(path.stat().st_size)
-    _check_unpacked_size(path.read_bytes())
+    content = path.read_bytes()
+    order = "<" if start[126:128] == b"IM" else ">"
+    at, unpacked = _HEADER, 0
+    # Refuse compression bombs: SciPy inflates without a limit.
+    while at + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        # Elements at the top level are not padded.
+        at += 8 + size
+        if kind == _COMPRESSED:
+            limit = most_unpacked(len(content)) - unpacked + 1
+            unpacked += len(zlib.decompressobj().decompress(content[at - size : at], limit))
+            refuse_bomb(unpacked, len(content))
     return read_in_worker("SciPy", path, sources)
 
 
@@ -193,20 +204,6 @@ def _nested(value: Any) -> Any:
     if value.dtype.kind == "O":
         return [_nested(cell) for cell in value.ravel(order="F")]
     return str(value.item()) if value.dtype.kind == "U" and value.size == 1 else value
-
-
-def _check_unpacked_size(content: bytes) -> None:
-    """Refuse compression bombs: SciPy inflates without a limit."""
-    order = "<" if content[126:128] == b"IM" else ">"
-    at, unpacked = _HEADER, 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        # Elements at the top level are not padded.
-        at += 8 + size
-        if kind == _COMPRESSED:
-            limit = most_unpacked(len(content)) - unpacked + 1
-            unpacked += len(zlib.decompressobj().decompress(content[at - size : at], limit))
-            refuse_bomb(unpacked, len(content))
 
 
 def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
@@ -251,12 +248,24 @@ class _Reader:
             raise ValueError("it is nested too deeply, or in a loop")
         if not hasattr(item, "shape"):  # a group, or a named type
             content = self.group(item, depth) if hasattr(item, "keys") else {}
-            return _struct_array(content)
+            lengths = {len(x) if isinstance(x, list) else -1 for x in content.values()}
+            if len(lengths) != 1 or -1 in lengths:
+                return content
+            # Fields that are all lists of one length are an array of structs.
+            return [{name: x[k] for name, x in content.items()} for k in range(lengths.pop())]
         self.bytes += int(item.size or 0) * item.dtype.itemsize
         # Before reading, because chunks that were never written take no space in the file.
         refuse_bomb(self.bytes, self.size)
         if item.dtype.kind == "O":
-            return self._referred(item, depth)
+            import h5py
+
+            # Of a cell, or of a field of an array of structs.
+            if h5py.check_ref_dtype(item.dtype) is not h5py.Reference:
+                return []
+            return [
+                self.item(self.file[reference], depth + 1) if reference else None
+                for reference in np.asarray(item[()]).ravel()
+            ]
         if item.dtype.kind not in "fiub" or item.shape is None:
             return None
         # Never read other files. An empty array stores its shape in place of samples.
@@ -268,25 +277,6 @@ class _Reader:
             return "".join(map(chr, values.ravel().tolist()))
         # MATLAB stores column by column, so matrices appear transposed.
         return values if kind is None else values.T
-
-    def _referred(self, item: Any, depth: int) -> list[Any]:
-        """Targets of the references in a cell, or in a field of an array of structs."""
-        import h5py
-
-        if h5py.check_ref_dtype(item.dtype) is not h5py.Reference:
-            return []
-        return [
-            self.item(self.file[reference], depth + 1) if reference else None
-            for reference in np.asarray(item[()]).ravel()
-        ]
-
-
-def _struct_array(content: dict[str, Any]) -> dict[str, Any] | list[dict[str, Any]]:
-    """Turn fields that are all lists of one length back into an array of structs."""
-    lengths = {len(value) if isinstance(value, list) else -1 for value in content.values()}
-    if len(lengths) != 1 or -1 in lengths:
-        return content
-    return [{name: value[k] for name, value in content.items()} for k in range(lengths.pop())]
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:

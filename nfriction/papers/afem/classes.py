@@ -101,7 +101,13 @@ def find_classes(
         ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
             or intervals name an unknown recording, joint or class.
     """
-    step = _sample_time(recordings)
+    steps = [float(np.median(np.diff(r.time))) for r in recordings]
+    if max(steps) > 1.1 * min(steps):
+        raise ValueError(
+            "recordings fitted by class of acceleration must share one sample time, as the class "
+            f"has a memory of samples; got {min(steps):g} to {max(steps):g} s."
+        )
+    step = float(np.median(steps))
     schedule.set_sample_time(step)
     qdd = [torch.as_tensor(m.qdd, dtype=torch.float64) for m in motions]
     qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
@@ -148,16 +154,6 @@ def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
     low = int(np.median(i[best]))
     same = best & (i == i[best][np.abs(i[best] - low).argmin()])
     return float(edges[i[same][0]]), float(edges[int(np.median(j[same]))])
-
-
-def _sample_time(recordings: Sequence[Recording]) -> float:
-    steps = [float(np.median(np.diff(r.time))) for r in recordings]
-    if max(steps) > 1.1 * min(steps):
-        raise ValueError(
-            "recordings fitted by class of acceleration must share one sample time, as the class "
-            f"has a memory of samples; got {min(steps):g} to {max(steps):g} s."
-        )
-    return float(np.median(steps))
 
 
 def _by_otsu(

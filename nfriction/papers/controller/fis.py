@@ -65,7 +65,15 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
     """
     sections = _sections(text)
     system = sections.get("System", {})
-    _check_system(system)
+    for key in ("Type", "NumInputs", "NumOutputs", "NumRules"):
+        if key not in system:
+            raise ValueError(f"[System] needs {key}; is this a .fis file?")
+    if _quoted(system["Type"]).lower() != "mamdani":
+        raise system["Type"].error("only systems of type 'mamdani' are read.")
+    for key, method in _METHODS.items():
+        # A missing method means the default, which is the method here.
+        if key in system and _quoted(system[key]) != method:
+            raise system[key].error(f"{key} must be {method!r}.")
     count = _count(system, "NumInputs")
     if len(units) != count:
         raise ValueError(f"`units` needs one for each of {count} inputs, got {list(units)}.")
@@ -114,18 +122,6 @@ def _sections(text: str) -> dict[str, dict[str, _Line]]:
             raise line.error(f"{key} comes twice in [{heading}].")
         section[key] = _Line(number, value)
     return sections
-
-
-def _check_system(system: dict[str, _Line]) -> None:
-    for key in ("Type", "NumInputs", "NumOutputs", "NumRules"):
-        if key not in system:
-            raise ValueError(f"[System] needs {key}; is this a .fis file?")
-    if _quoted(system["Type"]).lower() != "mamdani":
-        raise system["Type"].error("only systems of type 'mamdani' are read.")
-    for key, method in _METHODS.items():
-        # A missing method means the default, which is the method here.
-        if key in system and _quoted(system[key]) != method:
-            raise system[key].error(f"{key} must be {method!r}.")
 
 
 def _variables(

@@ -100,12 +100,16 @@ def train_on_samples(
     References:
         TLRIP paper, neuro-fuzzy friction estimation (2-10-2 networks, 40,000 samples per joint).
     """
+    kinds = (model_by_name(name) for name in model_names())
+    kind = next((k for k in kinds if issubclass(k, NeuroFuzzyModel) and k.definition is law), None)
+    if kind is None:
+        raise ValueError(f"there is no neuro-fuzzy model of the law {law.name!r}.")
     joints = len(controllers)
     network = RBFNetwork(joints, 2, units, len(law.names))
     # Units at samples, each where it best explains the residual of the others.
     network.init_ols(samples.x, samples.y, width=0.5)
     fits = train_network(network, samples.x, samples.y, options)
-    model = _neuro_fuzzy_class(law)(
+    model = kind(
         joints,
         samples.y.mean(0),
         v_smooth=v_smooth,
@@ -218,10 +222,3 @@ def _spanned(
         shares = [(1.0 - b, 1.0 - a) for a, b in reversed(shares)]
         terms = terms[::-1]
     return terms, [(start + width * a, start + width * b) for a, b in shares]
-
-
-def _neuro_fuzzy_class(law: Law) -> type[NeuroFuzzyModel]:
-    for model in map(model_by_name, model_names()):
-        if issubclass(model, NeuroFuzzyModel) and model.definition is law:
-            return model
-    raise ValueError(f"there is no neuro-fuzzy model of the law {law.name!r}.")

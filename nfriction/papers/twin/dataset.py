@@ -14,17 +14,14 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.io.files import atomic_write
 from nfriction.io.formats import write_table
 from nfriction.papers.twin.mechanics import HiddenFriction, Links, TrueMotion, Vector, simulate
 from nfriction.plant import PendulumChain, rigs
-from nfriction.recording import MINIMUM_SAMPLES, Recording, read_initial_states
+from nfriction.recording import MINIMUM_SAMPLES, Array, Recording, read_initial_states
 from nfriction.recording.angles import AngleConvention
-
-Array = NDArray[np.float64]
 
 Split = Literal["train", "test"]
 RATE = 1000  # samples per second
@@ -235,14 +232,23 @@ def record(
     random = np.random.default_rng([seed, 0])
     # The same encoders in all recordings, as on a real rig.
     encoders = [Encoder.drawn(random) for _ in plant.joint_names]
-    recordings = {}
+    convention, recordings = AngleConvention.of(plant), {}
     for index, (label, motion) in enumerate(truth.items()):
         # A stream for each release: a shorter twin is the beginning of a longer one.
         random = np.random.default_rng([seed, index + 1])
         late = JITTER * np.clip(random.standard_normal(len(motion.q)), -3.0, 3.0)
         # The release is the origin of time, and its state is known exactly.
         late[0] = 0.0
-        recordings[label] = _read(motion, encoders, late, plant, label)
+        # Jitter is far below a sample time, so second-order Taylor errors are far below a count.
+        moved = motion.q + late[:, None] * (motion.qd + 0.5 * late[:, None] * motion.qdd)
+        position = convention.position_from_joint(moved)
+        recordings[label] = Recording(
+            time=np.arange(len(position)) / RATE,
+            q=np.stack([e.read(q) for e, q in zip(encoders, position.T, strict=True)], axis=1),
+            names=plant.joint_names,
+            convention=convention,
+            name=label,
+        )
     return Twin(
         name=name,
         plant=plant,
@@ -330,22 +336,4 @@ def read(name: str, folder: Path) -> Twin:
         splits=dict(zip(overview["id"], overview["split"], strict=True)),
         initial_states=dict(read_initial_states(folder / "recordings.csv")),
         truth=truth,
-    )
-
-
-def _read(
-    motion: TrueMotion, encoders: list[Encoder], late: Array, plant: PendulumChain, label: str
-) -> Recording:
-    """A motion as logged by the rig's computer: evenly spaced stamps, samples `late` by [s]."""
-    convention = AngleConvention.of(plant)
-    late = late[:, None]
-    # Jitter is far below a sample time, so second-order Taylor errors are far below a count.
-    moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)
-    position = convention.position_from_joint(moved)
-    return Recording(
-        time=np.arange(len(position)) / RATE,
-        q=np.stack([e.read(q) for e, q in zip(encoders, position.T, strict=True)], axis=1),
-        names=plant.joint_names,
-        convention=convention,
-        name=label,
     )
