@@ -1229,7 +1229,8 @@ def _geared(plant: Plant, convention: AngleConvention, given: _Data) -> Iterator
         qd, qdd = (torch.as_tensor(convention.rate_to_joint(r * scale, first)) for r in rates)
         gain = torch.as_tensor(np.exp(x * drive))
         data = replace(given, q=at, qd=qd, qdd=qdd, tau=given.tau * gain)
-        return _unexplained(plant.replace(armature=plant.armature * gain.square()), data)
+        rig = plant.replace(armature=plant.armature * gain.square()) if drive.any() else plant
+        return _unexplained(rig, data)
 
     every = [("all positions are", eye.sum(0))] * (plant.joints > 1)
     alone = [(f"{name}'s position is", eye[j]) for j, name in enumerate(plant.joint_names)]
