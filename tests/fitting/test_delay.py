@@ -71,6 +71,7 @@ def test_fitted_delay_is_recovered_within_its_interval():
 @pytest.mark.slow
 def test_scores_use_the_fitted_delay():
     train, test = delayed("one"), delayed("two", 2.0)
+    test = test._replace(q=-test.q, tau=-test.tau)  # the other way, or a fit would have seen it
     settings = {"windows": (0.5, 1.5), "fit_plant": False}
     late = compare(LinearAxis(2.0), "CVFM", train, test, **settings)
     found = compare(LinearAxis(2.0), "CVFM", train, test, fit_delay=True, **settings)
