@@ -1358,13 +1358,13 @@ def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[
     norm = np.linalg.norm(scaled, axis=0)
     norm[norm == 0] = 1.0
     rows = np.column_stack([scaled / norm, left.flatten().numpy()])
+    count = 0 if extra is None else extra.numel() // data.q.numel()
     if not np.isfinite(rows).all():
-        return torch.full_like(weight, math.inf), torch.full((1,), math.nan)
+        return torch.full_like(weight, math.inf), torch.full((count,), math.nan)
     # The triangular factor has the same normal equations.
     _, factor = np.linalg.qr(rows)
     found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
     residual = weight * (left - design @ torch.as_tensor(found))
-    count = 0 if extra is None else extra.numel() // data.q.numel()
     factors = found[:count] - found[terms.shape[-1] :][:count]
     return residual.square().mean(0), torch.as_tensor(factors)
 

@@ -69,7 +69,7 @@ class FitResult:
         model: the friction model, trained in place; without gradients, so that rollouts are
             compiled. To train it further: `model.requires_grad_(True)`.
         plant: the plant with its adjusted terms.
-        plant_terms: name, value and bound of each adjusted term.
+        plant_terms: name, value and bound of each adjusted term, relative to the plant as given.
         status: `"Converged ..."` or `"Not converged: ..."` with the reason.
         converged: whether the search ended at a minimum.
         residual: root mean square residual in `residual_unit`: of the positions over the training
