@@ -334,20 +334,7 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join([*remarks, *failed.values()]))
-    normal = [plain_name(n) for n, of in fits.items()
-              if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
-    for one in given.joints:
-        # A sensor's noise without load is no sign.
-        if (
-            normal
-            and one.load is not None
-            and (negative := int((one.load < -SMALL * np.median(np.abs(one.load))).sum()))
-        ):
-            remarks.append(
-                f"The load of {one.name} is negative in {negative} rows, but laws of the load "
-                f"({', '.join(normal)}) take it for a normal force; give its magnitude. Only gear "
-                "needs its sign."
-            )
+    remarks += _signed_loads(given, fits)
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):
         shown = _shown(given.joints[k], of)
@@ -359,6 +346,23 @@ def fit_torque(
         remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
     given = replace(given, remarks=tuple(remarks))
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
+
+
+def _signed_loads(
+    table: TorqueTable, fits: Mapping[str, Sequence[torque_table.JointFit]]
+) -> Iterator[str]:
+    """A sentence for each load that has a sign although laws take it for a normal force."""
+    laws = [plain_name(n) for n, of in fits.items()
+            if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
+    for joint in table.joints if laws else ():
+        load = np.zeros(1) if joint.load is None else joint.load
+        # A sensor's noise without load is no sign.
+        if negative := int((load < -SMALL * np.median(np.abs(load))).sum()):
+            yield (
+                f"The load of {joint.name} is negative in {negative} rows, but laws of the load "
+                f"({', '.join(laws)}) take it for a normal force; give its magnitude. Only gear "
+                "needs its sign."
+            )
 
 
 def _useless(joint: JointTorque, chosen: Candidate) -> Iterator[str]:
