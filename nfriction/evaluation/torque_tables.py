@@ -51,6 +51,8 @@ WITH_BOTH = ("load-slip",)
 FENCE = 3.0
 # Errors below this part of the median torque do not matter.
 SMALL = 0.01
+# Share of the largest load up to which a negative one is noise of an unloaded sensor.
+NO_LOAD = 0.1
 # Rows far off are single mistakes up to this share, or number, which are listed.
 FEW, LISTED = 0.03, 3
 # A drive holds a speed within this part of it.
@@ -356,10 +358,9 @@ def _signed_loads(
             if n != "Gear" and torque_table.reads_load(of[0].model)]  # fmt: skip
     for joint in table.joints if laws else ():
         load = np.zeros(1) if joint.load is None else joint.load
-        # A sensor's noise without load is no sign.
-        if negative := int((load < -SMALL * np.median(np.abs(load))).sum()):
+        if load.min() < -NO_LOAD * np.abs(load).max():
             yield (
-                f"The load of {joint.name} is negative in {negative} rows, but laws of the load "
+                f"The load of {joint.name} is also negative, but laws of the load "
                 f"({', '.join(laws)}) take it for a normal force; give its magnitude. Only gear "
                 "needs its sign."
             )
@@ -371,13 +372,13 @@ def _useless(joint: JointTorque, chosen: Candidate) -> Iterator[str]:
     means = [joint.tau[k] - np.delete(joint.tau, k).mean() for k in parts]
     old = torch.tensor([float(np.square(x).mean()) for x in means])
     # Of motion in one direction, dry friction is the mean.
-    both = float(joint.qd.min() * joint.qd.max()) < 0.0
+    both = float(joint.moving.qd.min() * joint.moving.qd.max()) < 0.0
     if both and not improves(torch.tensor(chosen.errors) ** 2, old):
         yield (
             f"{plain_name(chosen.name)} predicts hold-out blocks of {joint.name} no better than "
-            "the mean torque does, so its coefficients say little: the table must contain friction "
-            "only (subtract the torque of gravity and masses), no rows far off, and motion that "
-            "recurs from block to block."
+            "the mean torque does. The table should contain friction only (subtract the torque of "
+            "gravity and masses), few rows at rest and no mistakes, and the motion should recur "
+            "from block to block."
         )
 
 

@@ -161,12 +161,14 @@ def likely_mistakes(
     found = [] if zeroed else [Mistake(*cause) for cause in unlike]
     if noise < stated:
         zeros = min((share for _, share in unlike), default=math.inf)
-        of = plant, recordings, motions, convention, given
-        found += _above_noise(*of, options, zeros, presliding)
+        found += _above_noise(
+            plant, recordings, motions, convention, given, options, zeros, presliding
+        )
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         found = [*_driven_without_torque(plant, recordings, motions, options)]
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
     least = min((mistake.unexplained for mistake in found), default=math.nan)
+    # A share that is unknown, NaN, is never larger.
     sure = [m for m in found if not m.unexplained >= options.diagnosis_tie * least]
     return stated, tuple(sure[:3])
 
@@ -244,7 +246,7 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
 def correction_note(stated: float, mistake: Mistake) -> str:
     """A mistake in the rig that a fit corrects, in a sentence."""
     text = f"{mistake.text[0].upper()}{mistake.text[1:]}.{_shares(stated, mistake)}"
-    return f"{text} The fit starts from the corrected rig; its terms are relative to the given one."
+    return f"{text} The fit starts from the corrected rig; terms are relative to the rig as given."
 
 
 def _shares(stated: float, mistake: Mistake) -> str:
@@ -796,9 +798,8 @@ def _corrected_torques(
         without = replace(given, tau=given.tau - part)
         gain = float(_balance(without, without.tau - given.needed(plant), part)[1])
         if gain and abs(gain - 1) > options.gain_term[0]:
-            wrong = f"{_too_large(gain)} (a unit, torque constant or gear ratio)"
-            cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
-            yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
+            text = f"{what} {_wrong_by(gain, ' (a unit, torque constant or gear ratio)')}"
+            yield text, replace(given, tau=given.tau + (gain - 1) * part)
     needed = given.needed(plant)
     for j in driven:
         tau = given.tau[:, j]
@@ -810,11 +811,13 @@ def _corrected_torques(
             yield text, replace(given, tau=signed)
 
 
-def _too_large(gain: float) -> str:
+def _wrong_by(gain: float, causes: str = "") -> str:
     """The error of a torque that must be multiplied by a gain, in a clause."""
+    if -1.5 < gain < -0.7:
+        return "has the wrong sign"
     size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
     # Three digits, but 1000 and not 1e+03.
-    wrong = f"is {float(f'{abs(size):.3g}'):g} times too {way}"
+    wrong = f"is {float(f'{abs(size):.3g}'):g} times too {way}{causes}"
     return "has the wrong sign and " * (gain < 0) + wrong
 
 
@@ -824,7 +827,7 @@ def _unlike_gains(plant: Plant, given: _Data, options: FitOptions) -> Iterator[t
     without = replace(given, tau=torch.zeros_like(given.tau))
     _, gains = _balance(without, -needed, torch.diag_embed(given.tau)[..., driven])
     wrong = [
-        f"that of {plant.joint_names[j]} {_too_large(gain)}"
+        f"that of {plant.joint_names[j]} {_wrong_by(gain)}"
         for j, gain in zip(driven, gains.tolist(), strict=True)
         if gain and abs(gain - 1) > options.gain_term[0]
     ]

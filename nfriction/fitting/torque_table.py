@@ -93,7 +93,7 @@ def fit_joint(
     law = _for_slow(model.law, v_smooth / V_SMOOTH)
     if len(joint) <= len(law.coefficients):
         raise ValueError(
-            f"{joint.name} has {len(joint)} rows, too few for the {len(law.coefficients)} "
+            f"{joint.name} moves in {len(joint)} rows, too few for the {len(law.coefficients)} "
             f"coefficients of {name}; measure at more velocities."
         )
     require_load(name, joint)
@@ -129,7 +129,7 @@ def fit_joint(
 def _for_slow(law: Law, share: float) -> Law:
     """A law with further start values, and so bounds, that suit slow joints and axes in m.
 
-    `share` is the width of the smoothed sign over that of the velocities which the law's own suit.
+    `share` is the ratio of the joint's velocities to those that the law's own start values suit.
     """
     factor = {"rad/s": share, "s/rad": 1 / share}
     every = (

@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from nfriction.io.files import parse_json, write_atomically
+from nfriction.io.files import is_intact, parse_json, write_atomically
 from nfriction.plant import robot_file
 from nfriction.plant.base import LinearAxis, Plant
 from nfriction.plant.chain import Arm, PendulumChain
@@ -314,10 +314,13 @@ def read(path: str | Path) -> Plant:
             # Before it is read into memory.
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
         content = _parse(path.read_bytes().decode(), path.suffix.lower())
-        # A model file contains the rig as its fit adjusted it.
-        if isinstance(content, Mapping) and content.get("rig", content) is None:
-            raise ValueError("this model file contains no rig; give a rig file.")
-        return from_dict(content.get("rig", content) if isinstance(content, Mapping) else content)
+        if isinstance(content, dict) and "checksum" in content:
+            if not is_intact(content):
+                raise ValueError("the checksum does not match; damaged or edited.")
+            content = content.get("rig")
+            if content is None:
+                raise ValueError("this model file contains no rig; give a rig file.")
+        return from_dict(content)
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too

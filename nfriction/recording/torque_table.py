@@ -406,7 +406,7 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         qd, qdd = _derivatives(time, q, qdd)
         if slow := time_unit(time):
             remarks.append(
-                f"`time` looks like {slow[1]}; if so, divide it, or read it with "
+                f"`time` looks like {slow[1]}; if so, divide it by {slow[2]:g}, or read it with "
                 f'columns={{"time": "time:{slow[0]}"}}.'
             )
     elif qdd is None:
@@ -458,9 +458,9 @@ def _doubts(joint: JointTorque, *, turns: bool) -> Iterator[str]:
     ratio = float(moved @ expected) / max(float(expected @ expected), 1e-300)
     if not 1 / FOLLOWS < ratio < FOLLOWS:
         yield (
-            f"q of {joint.name} changes {ratio:.3g} times as much as qd and time say; laws with "
-            "memory follow q, other laws qd: check the sign and the unit of both, and of time, and "
-            "that both are of this joint and on the same side of its gear."
+            f"q of {joint.name} changes {ratio:.3g} times as much as qd and time imply; laws with "
+            "memory follow q, other laws qd: check the sign and the unit of both, and of time, an "
+            "offset of qd, and that both are of this joint and on the same side of its gear."
         )
 
 

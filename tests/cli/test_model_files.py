@@ -53,6 +53,10 @@ def test_next_command_printed_by_fit_works(
     read, given = rigs.read(fitted), rigs.read(bench / "bench.json")
     assert not torch.equal(read.inertia_coupling, given.inertia_coupling)
     assert read.to_dict() == load_plant(fitted).to_dict()
+    edited = fitted.with_name("edited.json")
+    edited.write_text(fitted.read_text().replace('"kind": "chain"', '"kind": "axis"'))
+    with pytest.raises(ValueError, match=r"edited.json: the checksum does not match"):
+        rigs.read(edited)
     # Four digits are printed.
     assert values(output, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
     (command,) = (line for line in output.splitlines() if line.startswith("next: "))

@@ -467,6 +467,7 @@ def test_mistakes_in_positions_are_named(name, change, finding):
         ("driven", lambda tau: -tau, "every torque has the wrong sign"),
         ("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
         ("driven", lambda tau: tau * [3.0, 0.4], "different factors: that of joint1 is 3"),
+        ("driven", lambda tau: tau * [0.3, -1.0], "and that of joint2 has the wrong sign (torque"),
         ("driven", lambda tau: tau[:, ::-1], "the torques of joint1 and joint2 are exchanged"),
         ("driven", lambda tau: later(tau, 10), "torques are recorded 18"),
         ("motor", lambda tau: tau / 0.12, "the torque of joint1 is 8.3"),
@@ -531,7 +532,7 @@ def test_free_rig_with_guessed_masses_and_lengths_is_corrected(mass, length):
     rating, reason = found.usability
     assert rating == "doubtful"
     (note,) = (text for text in found.warnings if text.startswith("Several terms of the rig are"))
-    assert note.endswith("from the corrected rig; its terms are relative to the given one.")
+    assert note.endswith("from the corrected rig; terms are relative to the rig as given.")
     if length == 0.3:
         assert reason.startswith("several terms of the rig are wrong, see warnings")
         assert not found.mistakes

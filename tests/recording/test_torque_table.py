@@ -137,7 +137,9 @@ def test_positions_that_contradict_velocity_and_time_are_reported() -> None:
     cases = ((-q, "-1"), (np.rad2deg(q), "57.3"), (100 * q, "100"), (other, "-?0.[01]"))
     for wrong, factor in cases:
         (remark,) = TorqueTable.from_pandas(sound.assign(q=wrong)).remarks
-        assert re.match(f"q of joint1 changes {factor}.* times as much as qd and time say", remark)
+        assert re.match(
+            f"q of joint1 changes {factor}.* times as much as qd and time imply", remark
+        )
     slow = sound.assign(time=1e3 * time)
     (remark,) = TorqueTable.from_pandas(slow).remarks
     assert "0.001 times" in remark

@@ -155,19 +155,18 @@ class FitResult:
     def with_terms_times(self, ratios: Mapping[str, float]) -> "FitResult":
         """The same with relative terms of the plant stated for another rig, by name.
 
-        The plant stays; each `ratio` is that of the present reference to the new one.
+        The plant stays; `ratios` are those of the terms of the present rig to the other one.
         """
 
         def changed(name: str, value: float) -> float:
             return (1.0 + value) * ratios[name] - 1.0 if name in ratios else value
 
         terms = tuple((name, changed(name, x), changed(name, b)) for name, x, b in self.plant_terms)
-        intervals = tuple(
-            replace(i, value=value, low=low, high=high)
-            for i in self.intervals
-            for value, low, high in [[changed(i.name, x) for x in (i.value, i.low, i.high)]]
-        )
-        return replace(self, plant_terms=terms, intervals=intervals)
+        intervals = []
+        for i in self.intervals:
+            value, low, high = (changed(i.name, x) for x in (i.value, i.low, i.high))
+            intervals.append(replace(i, value=value, low=low, high=high))
+        return replace(self, plant_terms=terms, intervals=tuple(intervals))
 
     def without(self, warnings: Sequence[str]) -> "FitResult":
         """The same without these warnings."""

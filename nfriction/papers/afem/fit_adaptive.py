@@ -90,7 +90,7 @@ def fit_adaptive(
     task = prepare_task(
         model, plant, recordings, like_start(options, start), start, motions, callback
     )
-    return fit_by_class(task, classes).with_own_model()
+    return fit_by_class(task, classes).with_terms_times(task.ratios).with_own_model()
 
 
 def like_start(options: FitOptions, start: FitResult | None) -> FitOptions:

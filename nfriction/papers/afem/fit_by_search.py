@@ -428,7 +428,7 @@ def fit_by_search(
         task, varied, windows = by_class.task, by_class.given, by_class.windows
         table = by_class.table
     else:
-        constant = start or fit_constant(task)
+        constant = task.start or fit_constant(task)
         schedule.set_coefficients(constant.model.schedule.coefficient_sets()["always"])
         windows = cut_windows(task.recordings, task.motions, length)
     step = max(r.longest_step for r in task.recordings)
@@ -460,10 +460,10 @@ def fit_by_search(
         motions=task.motions,
         residuals=residuals,
     )
-    if by_class is None:
-        return found
-    baseline = error.rms(error.residuals(objective.mean))
-    return by_class.backtracked(found, windows, baseline)
+    if by_class is not None:
+        baseline = error.rms(error.residuals(objective.mean))
+        found = by_class.backtracked(found, windows, baseline)
+    return found.with_terms_times(task.ratios)
 
 
 @dataclass(frozen=True, eq=False)

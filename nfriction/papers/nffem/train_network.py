@@ -233,16 +233,8 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
 
 
 def _check_range(network: FuzzyNetwork, x: Tensor) -> None:
-    # Range in which sets or units of each input exceed about 1 %; of a new network [-1, 1].
-    layer = network.anfis if isinstance(network, AnfisRBF) else network
-    if isinstance(layer, RBFNetwork):
-        centres, reach = layer.centres, 3 * layer.log_widths.exp()
-        lower, upper = (centres - reach).amin(1), (centres + reach).amax(1)
-    else:
-        by_input = (values.split(layer.terms, 1) for values in layer.sets())
-        pairs = [(c, 3 * w) for c, w in zip(*by_input, strict=True)]
-        lower = torch.stack([(c - w).amin(1) for c, w in pairs], 1)
-        upper = torch.stack([(c + w).amax(1) for c, w in pairs], 1)
+    # A new network has its sets or units within [-1, 1].
+    lower, upper = _reach(network.anfis if isinstance(network, AnfisRBF) else network)
     least, most = x.amin(0), x.amax(0)
     covered = torch.minimum(upper, most) - torch.maximum(lower, least)
     if (covered < 0.1 * (most - least)).any():
@@ -250,6 +242,19 @@ def _check_range(network: FuzzyNetwork, x: Tensor) -> None:
             "the network's sets or units cover less than a tenth of the range of an input; drop "
             "outliers, or place them first: `init_grid(x.amin(0), x.amax(0))`, `init_kmeans(x)`."
         )
+
+
+def _reach(layer: Anfis | RBFNetwork) -> tuple[Tensor, Tensor]:
+    """Range in which sets or units of each input exceed about 1 %, each (group, input)."""
+    if isinstance(layer, RBFNetwork):
+        centres, reach = layer.centres, 3 * layer.log_widths.exp()
+        return (centres - reach).amin(1), (centres + reach).amax(1)
+    centres, widths = (values.split(layer.terms, 1) for values in layer.sets())
+    pairs = [(c, 3 * w) for c, w in zip(centres, widths, strict=True)]
+    return (
+        torch.stack([(c - w).amin(1) for c, w in pairs], 1),
+        torch.stack([(c + w).amax(1) for c, w in pairs], 1),
+    )
 
 
 class NetworkGroup:

@@ -54,6 +54,25 @@ def case():
     return plant, train, held, motions, constant
 
 
+def test_terms_are_relative_to_the_rig_as_given_though_it_is_corrected():
+    recording = swing(pendulum(), true_model(), seconds=4.0, start=(2.6, 0.2))
+    guessed = pendulum().replace(
+        gravity_moment=torch.tensor([1.0, 2.0]) * pendulum().gravity_moment
+    )
+    constant = fit("load-coulomb", guessed, recording, windows=(0.5,))
+    assert any("fit starts from the corrected rig" in text for text in constant.warnings)
+    options, few = FitOptions(windows=(0.5,), max_steps=2), SearchOptions(max_evaluations=50)
+    for found in (
+        constant,
+        fit_adaptive(ALFM(2), guessed, recording, options=options, start=constant),
+        fit_by_search(LFM(2), guessed, recording, options=few, start=constant),
+    ):
+        (change,) = (x for name, x, _ in found.plant_terms if name == "gravity 2")
+        true = found.plant.gravity_moment[1] / guessed.gravity_moment[1] - 1.0
+        assert change == pytest.approx(float(true), rel=1e-6)
+        assert change < -0.3
+
+
 def fitted(case, model=None, **settings):
     plant, train, _, motions, constant = case
     options = FitOptions(fit_plant=False, windows=(1.0,), max_steps=settings.pop("max_steps", 30))
