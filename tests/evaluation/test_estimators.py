@@ -183,6 +183,7 @@ def test_misuse_raises_clear_errors(recordings: list[Recording]) -> None:
         FrictionEstimator("penduluum").fit(recordings)
 
 
+@pytest.mark.slow
 def test_estimator_works_in_grid_search_and_cross_validation(recordings: list[Recording]) -> None:
     sklearn = pytest.importorskip("sklearn")
     from sklearn.model_selection import GridSearchCV, LeaveOneOut, cross_val_score

@@ -59,7 +59,7 @@ def test_every_example_is_known() -> None:
 
 
 # A cluster's processes load the whole package first; networks train for seconds.
-SLOW = {"feedforward", "many_fits_on_dask", "neuro_fuzzy"}
+SLOW = {"feedforward", "many_fits_on_dask", "neuro_fuzzy", "rtip_table_4"}
 RUNS = [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW))
         for path in EXAMPLES]  # fmt: skip
 

@@ -31,7 +31,9 @@ needs_onnx = pytest.mark.skipif(
 
 
 @needs_onnx
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "NFLFM")) for n in QUICK]
+)
 def test_model_and_double_export_agree(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.onnx", "float64", 5000)
 

@@ -117,6 +117,7 @@ def test_a_delay_needs_torques_and_simulated_windows():
         FitOptions(method="equation_error", fit_delay=True)
 
 
+@pytest.mark.slow
 def test_half_a_sample_of_delay_is_reported():
     """A torque that changes within samples; the log contains the value measured at each."""
     fine = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=3.0)

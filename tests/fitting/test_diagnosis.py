@@ -108,6 +108,7 @@ def test_a_wrong_gear_ratio_of_a_motor_is_named():
     assert re.search(r"the gear ratio of joint2 is (0\.66|0\.67)\d* times that of the rig", found)
 
 
+@pytest.mark.slow
 def test_exchanged_columns_of_motors_with_different_gears_are_named():
     _, q, tau = measured("driven")
     geared = PendulumChain(**DOUBLE, motor=Motor([50.0, 30.0], torque_constant=[0.1, 0.2]))
@@ -118,6 +119,7 @@ def test_exchanged_columns_of_motors_with_different_gears_are_named():
     assert "the columns of joint1 and joint2 are exchanged" in found
 
 
+@pytest.mark.slow
 def test_motors_in_the_base_are_named_with_a_remedy_for_motors():
     _, q, tau = measured("driven")
     absolute = np.cumsum(q, axis=1)
@@ -145,6 +147,7 @@ def test_sharp_torque_reversal_is_no_spike():
     assert len([*inputs._spikes([spiked], FitOptions())]) == 1
 
 
+@pytest.mark.slow
 def test_unusual_gain_of_one_drive_is_named():
     plant, q, tau = measured("driven")
     time, convention = STEP * np.arange(len(q)), "relative,upright"
@@ -264,6 +267,7 @@ def test_play_in_a_gear_is_named(play, named):
     assert [80 < int(found[1]) < 130 for found in shares if found] == [True] * named
 
 
+@pytest.mark.slow
 def test_fit_with_play_in_the_gear_is_doubtful():
     q, tau = geared(math.radians(1.0))
     recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
@@ -891,7 +895,7 @@ def of_several_days(rig: Plant, friction: list[float]) -> list[Recording]:
     ]
 
 
-@pytest.mark.parametrize("zero", ["upright", "hanging"])
+@pytest.mark.parametrize("zero", ["upright", pytest.param("hanging", marks=pytest.mark.slow)])
 def test_a_recording_of_another_rig_is_named(zero):
     """Also if all encoders read zero at first, and may have been zeroed in any pose."""
     plant = measured("motor")[0]
@@ -908,7 +912,8 @@ def test_a_recording_of_another_rig_is_named(zero):
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
 
 
-@pytest.mark.parametrize("factor", [3.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [3.0, 0.3])
 def test_friction_change_between_recordings_is_not_another_rig(factor):
     plant = measured("motor")[0]
     recordings = of_several_days(plant, [0.3 * factor, 0.12 * factor])
@@ -946,6 +951,7 @@ def assert_drift(warned: tuple[str, ...], factors: dict[str, float]) -> None:
         assert abs(float(found) - 100 * abs(factor - 1)) < float(within) + 20
 
 
+@pytest.mark.slow
 def test_recordings_zeroed_in_different_poses_are_of_one_rig():
     made = [zeroed_in_a_pose(np.array(zero)) for zero in ((0.02, -0.03), (-0.01, 0.02))]
     plant, recordings = made[0][0], [recording for *_, recording in made]
@@ -1005,6 +1011,7 @@ def test_a_spike_is_named_with_its_time(rounded):
     assert "joint2 jumps for one sample at 2 s;" in found
 
 
+@pytest.mark.slow
 def test_lost_counts_and_missing_samples_are_named_with_their_time():
     plant, q, tau = measured("driven")
     (found,) = (w for w in warnings_of(plant, q + (q * 0 + [0, 0.3]) * LATER, tau) if "good" in w)
@@ -1281,7 +1288,9 @@ def test_fit_that_determines_no_friction_is_unusable():
     assert nothing.usability == ("do not use", "the data determine no coefficient of the friction")
 
 
-@pytest.mark.parametrize("method", ["equation_error", "output_error"])
+@pytest.mark.parametrize(
+    "method", ["equation_error", pytest.param("output_error", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("weight", [5.0, pytest.param(-98.0, marks=pytest.mark.slow)])
 def test_weight_missing_in_the_rig_does_not_bias_friction(method, weight):
     plant, q, tau = measured("axis")
@@ -1339,6 +1348,7 @@ def test_rows_stamped_in_batches_are_refused():
         fit(CVFM(1), plant, recording)
 
 
+@pytest.mark.slow
 def test_clipped_or_stuck_torque_sensor_is_named():
     plant, q, tau = measured("wheel")
 

@@ -70,6 +70,7 @@ def test_friction_and_masses_are_recovered_from_irregular_stamps():
         )
 
 
+@pytest.mark.slow
 def test_drive_gain_below_one_is_recovered():
     plant = geared()
     truth = plant.replace(torque_gain=torch.tensor([1.0, 0.85], dtype=F64))
@@ -272,7 +273,7 @@ def fitted_offset(plant, truth, recording, share):
     return model.schedule.values[:, 0]
 
 
-@pytest.mark.parametrize("bare", [True, False])
+@pytest.mark.parametrize("bare", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_missing_rotor_inertia_is_named_if_it_biases_other_terms(bare):
     truth = geared().replace(armature=torch.tensor([0.03, 0.03], dtype=F64))
     given = geared().replace(armature=(0.0 if bare else 0.9) * truth.armature)
@@ -290,6 +291,7 @@ def test_rotor_inertia_of_a_wheels_motor_is_added(motor):
     assert (rotor_warning(problem, (), ("inertia 11",)) == ()) == has_rotor
 
 
+@pytest.mark.slow
 def test_delay_is_recovered_with_encoders_zeroed_at_rest():
     """At first nothing acts, although torques are logged."""
     plant, law = geared(), CVFM(2, [[0.05, 0.010], [0.03, 0.005]], v_smooth=V_SMOOTH)

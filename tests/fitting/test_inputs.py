@@ -76,7 +76,13 @@ def rig(name: str) -> PendulumChain:
     return plant.replace(load_waves=WAVES, load_phase=PHASES) if name == "position" else plant
 
 
-@pytest.fixture(scope="module", params=TRUTHS)
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("direction", "position", "heat")))
+        for name in TRUTHS
+    ],
+)
 def recorded(request):
     # Both links move over half a wave.
     start = (1.2, 0.8) if request.param == "position" else None
@@ -224,6 +230,7 @@ def test_an_accepted_network_has_the_interval_of_the_fall_by_heat(monkeypatch) -
     assert falls == pytest.approx(model.schedule.rest_coefficients()[:, 2].tolist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
 def test_friction_change_counts_against_a_network_only_without_heat(inputs, monkeypatch):
     falls = [("friction", "The friction of joint1 falls by 30 %.")]
@@ -533,6 +540,7 @@ def test_position_and_load_exclude_each_other(law, inputs) -> None:
         with_inputs(law, inputs)
 
 
+@pytest.mark.slow
 def test_wavelengths_of_an_axis_are_limited_by_its_stroke() -> None:
     axis, stroke = LinearAxis(mass=2.0), 2.5
     law = with_inputs(COULOMB_VISCOUS, ["position"])

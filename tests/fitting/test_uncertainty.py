@@ -52,6 +52,7 @@ def fits(swings):
         return law, fit(network, *swings, start=law, **options)
 
 
+@pytest.mark.slow
 def test_intervals_include_torque_noise():
     """It affects all later samples in windows whose initial state absorbs most of it."""
     off = []

@@ -240,6 +240,7 @@ def test_a_negative_seed_is_refused_by_name(
     assert "argument --seed: must be a whole number from 0, got '-1'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_networks_tolerate_noise_on_their_targets(
     tmp_path: Path,
     cache: Path,
