@@ -277,7 +277,7 @@ def test_rows_at_rest_are_excluded() -> None:
     assert float(found.score(table).rmse.iloc[0]) < 0.003
 
 
-def test_what_holds_a_joint_at_rest_does_not_shift_a_law_without_memory() -> None:
+def test_torque_at_rest_does_not_shift_a_law_without_memory() -> None:
     moving = stribeck_table(600)
     still = pd.DataFrame({"time": 10.1 + 0.01 * np.arange(600), "qd": 1e-5, "tau": 0.9})
     both = pd.concat([moving, still], ignore_index=True)
