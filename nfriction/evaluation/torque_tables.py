@@ -607,7 +607,7 @@ def _fit(
     shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
-        # What holds a joint at rest depends on the motion before, which these laws do not know.
+        # The torque at rest depends on the motion before, which these laws do not know.
         rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test)).moving
         left = joint.rows(test)
         constant = torque_table.fit_joint(name, rest, v_smooth, options)

@@ -216,7 +216,7 @@ class RBFNetwork(grouped.LinearOutputModule):
             given = (own / scale).cpu().numpy()
             found, _ = kmeans2(given, self.units, iter=50, minit="++", seed=seed)
             self.centres[group] = centres = torch.as_tensor(found).to(own) * scale
-            spread = torch.ones(1, 1).to(scale)
+            spread = torch.ones(1, 1).to(scale)  # of a single unit
             if self.units > 1:
                 distance = torch.cdist(centres / scale, centres / scale)
                 # The smallest distance is that from a centre to itself.

@@ -213,15 +213,7 @@ class TorqueTable:
             raise ValueError(f'`unit` must be "rad" or "m", got {unit!r}.')
         table = table.set_axis([str(name) for name in table.columns], axis=1)
         sources = _sources(table, columns or {})
-        for (kind, _), (column, written) in sources.items():
-            if kind in ("q", "qd") and written and is_unit(written):
-                written = canonical_unit(written)
-                true = "m" if slides(written.removesuffix("/s")) else "rad"
-                if true != unit:
-                    raise ValueError(
-                        f"`unit` is {unit!r}, but column {column} is in {written}; read the table "
-                        f"with `unit={true!r}` (`--unit {true}`)."
-                    )
+        _require_unit(unit, sources)
         values = {
             key: _numbers(table, key[0], *source, degrees=degrees)
             for key, source in sources.items()
@@ -437,6 +429,18 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
             "it must be positive with positive velocity. If the sign is wrong, reverse it."
         )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
+
+
+def _require_unit(unit: Unit, sources: Mapping[_Key, tuple[str, str | None]]) -> None:
+    """Raise ValueError if a column's own unit contradicts the unit of positions."""
+    for (key, _), (column, own) in sources.items():
+        if key in ("q", "qd") and own and is_unit(own):
+            found = "m" if slides(canonical_unit(own).removesuffix("/s")) else "rad"
+            if found != unit:
+                raise ValueError(
+                    f"`unit` is {unit!r}, but column {column} is in {canonical_unit(own)}; read "
+                    f"the table with `unit={found!r}` (`--unit {found}`)."
+                )
 
 
 def _doubts(joint: JointTorque, *, turns: bool) -> Iterator[str]:
