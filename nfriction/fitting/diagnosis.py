@@ -164,8 +164,10 @@ def likely_mistakes(
         found += _above_noise(
             plant, recordings, motions, convention, given, options, zeros, presliding
         )
-    if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
-        found = [*_driven_without_torque(plant, recordings, motions, options)]
+    if not found and not given.tau.any():
+        # With a slightly wrong rig, the energy would seem to rise.
+        rig = _with_usual_errors(plant, given, options)
+        found = [*_driven_without_torque(rig, recordings, motions, options)]
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
     least = min((mistake.unexplained for mistake in found), default=math.nan)
     # A share that is unknown, NaN, is never larger.
@@ -201,9 +203,11 @@ def _above_noise(
         if term.lower <= x <= term.upper:
             sound = min(share, sound)  # The fit corrects this by itself.
         else:
-            cause = f"{term.name} is {1 + x:.3g} times that of the rig", share
+            text = f"{term.name} is {1 + x:.3g} times that of the rig"
+            if plant.joints == 1 and term.name.startswith("inertia"):
+                text += f", or the true sample rate is {math.sqrt(1 + x):.3g} times that in `time`"
             # Without a drive, a guessed inertia is likelier than a missing rotor.
-            tested.insert(len(tested) if given.driven else 0, cause)
+            tested.insert(len(tested) if given.driven else 0, (text, share))
     if sound <= noise:
         return []
     if len(recordings) > 1:
@@ -398,12 +402,14 @@ def _broken(recordings: Sequence[Recording], options: FitOptions) -> Iterator[Mi
 
 
 def _driven_without_torque(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
     options: FitOptions,
 ) -> Iterator[Mistake]:
     """The first recording whose energy rises by more than an error of the rig could explain."""
+    if not isinstance(plant, PendulumChain | LinearAxis):
+        return
     for recording, motion in zip(recordings, motions, strict=True):
         # At rest, or held: only rounding moves.
         if not np.ptp(recording.q, axis=0).all():
@@ -783,6 +789,29 @@ def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[
         yield Mistake(text, _unexplained(rig, given), rig, ratios, timed)
 
 
+def _with_usual_errors(plant: Plant, given: _Data, options: FitOptions) -> Plant:
+    """The plant with those errors of its terms, within 95 % of their priors, that explain most."""
+    from scipy.optimize import lsq_linear  # slow to import
+
+    own = plant_parameters(plant, driven=given.driven, options=options)
+    zeros = [term for term in own if term.name.startswith("angle offset")]
+    terms = [*zeros, *(term for term in own if term.ratio)]
+    slopes = [-slope for part in _torques_of_terms(plant, given, options) for slope in part]
+    if not terms:
+        return plant
+    left, design, _ = _equations(given, given.tau - given.needed(plant), torch.stack(slopes, -1))
+    rows: Array = torch.cat([design, left[..., None]], -1).flatten(0, 1).numpy()
+    if not np.isfinite(rows).all():
+        return plant
+    # Friction takes energy away.
+    low, high = np.zeros(rows.shape[1] - 1), np.full(rows.shape[1] - 1, np.inf)
+    low[: -given.friction.shape[-1]] = -np.inf
+    high[: len(terms)] = [NORMAL_95 * term.prior_sd for term in terms]
+    low[: len(terms)] = -high[: len(terms)]
+    found = lsq_linear(rows[:, :-1], rows[:, -1], (low, high), method="bvls").x
+    return adjusted_plant(plant, terms, torch.as_tensor(found[: len(terms)]))
+
+
 def _corrected_torques(
     plant: Plant, given: _Data, options: FitOptions
 ) -> Iterator[tuple[str, _Data]]:
@@ -799,6 +828,8 @@ def _corrected_torques(
         gain = float(_balance(without, without.tau - given.needed(plant), part)[1])
         if gain and abs(gain - 1) > options.gain_term[0]:
             text = f"{what} {_wrong_by(gain, ' (a unit, torque constant or gear ratio)')}"
+            if gain > 0 and joints == driven:
+                text += ", or all masses and inertias of the rig are wrong by this factor"
             yield text, replace(given, tau=given.tau + (gain - 1) * part)
     needed = given.needed(plant)
     for j in driven:
@@ -1191,13 +1222,15 @@ def _unbalanced(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
 def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     """Each driven joint with a torque that repeats with its position, as of a motor's magnets."""
     left, terms, weight = _equations(given, given.tau - given.needed(plant))
+    # Gravity repeats once per turn.
+    slowest = 2 if weighs(plant) else 1
     for j in given.driven if plant.unit == "rad" else ():
         q, known = given.q[:, j], terms[:, j]
         span = float(q.max() - q.min())
         # At least two periods within the motion.
         if not 2 * math.tau < MOST_PER_TURN * span < math.inf:
             continue
-        rates = torch.arange(math.ceil(2 * math.tau / span), MOST_PER_TURN + 1)
+        rates = torch.arange(max(slowest, math.ceil(2 * math.tau / span)), MOST_PER_TURN + 1)
         waves = torch.stack([(q[:, None] * rates).sin(), (q[:, None] * rates).cos()], 2)
         waves = (given.moving[:, [j], None] * given.mean(waves)).movedim(1, 0)
         known = torch.linalg.qr(known[:, known.any(0)]).Q

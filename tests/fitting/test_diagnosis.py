@@ -24,16 +24,18 @@ from nfriction import (
     rollout,
 )
 from nfriction.fitting import diagnosis
+from nfriction.fitting.adjusted_plant import adjusted_plant
 from nfriction.fitting.data import inputs
 from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
 from nfriction.fitting.strategy import constant
 from nfriction.fitting.task import prepare_task
 from nfriction.recording.validation import time_unit
 from nfriction.signals import kalman_smoother, quantise
 from tests.evaluation.test_score import zeroed_in_a_pose
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import one_link, pendulum, swing
 
 COUNT = 2 * math.pi / 4096
 WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
@@ -741,6 +743,31 @@ def test_advanced_torque_is_aligned_again():
     assert warnings_of(plant, aligned.q, aligned.tau) == ()
     with pytest.raises(ValueError, match="no torque to advance"):
         Recording(late.time, q).advance_torque(0.01)
+
+
+@pytest.mark.parametrize("seed", [4, 13])
+def test_errors_of_a_drawing_are_no_gain_of_energy(seed):
+    """The energy of a free swing rises if it is computed with slightly wrong terms."""
+    links = {"mass": [0.2, 0.27, 0.34], "length": [0.3, 0.3, 0.23], "com": [0.12, 0.18, 0.08]}
+    plant = PendulumChain(**links, inertia=[2e-3, 3e-3, 2e-3])
+    truth = CVFM(3, [[0.02, 1e-3], [0.012, 1e-3], [0.006, 1e-3]])
+    recording = swing(plant, truth, seconds=6.0, start=(2.2, 1.0, 0.8))
+    terms = plant_parameters(plant, driven=[])
+    draw = torch.Generator().manual_seed(seed)
+    sizes = torch.randn(len(terms), generator=draw, dtype=torch.float64).clamp(-1.9, 1.9)
+    usual = torch.tensor([term.prior_sd for term in terms], dtype=torch.float64)
+    wrong = adjusted_plant(plant, terms, sizes * usual)
+    assert not any("gains energy" in w for w in warnings_of(wrong, recording.q, None))
+    reverse = np.ascontiguousarray(recording.q[::-1])
+    assert any("gains energy" in w for w in warnings_of(wrong, reverse, None))
+
+
+def test_wrong_sample_rate_of_a_single_link_is_named_beside_its_inertia():
+    """The balance determines only the inertia times the square of the rate."""
+    plant = one_link()
+    recording = swing(plant, CVFM(1, [[0.006, 1e-3]]), seconds=6.0)
+    (text, *_) = warnings_of(plant, recording.q, None, time=2 * recording.time)
+    assert "or the true sample rate is 2" in text
 
 
 @pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
