@@ -494,11 +494,17 @@ def _torques_of_terms(
     """Torque per unit of each encoder zero, and of each term of inertia and gravity."""
     needed = data.needed(plant)
     found: tuple[list[Tensor], list[Tensor]] = ([], [])
-    for term in plant_parameters(plant, driven=data.driven, options=options):
-        if term.ratio or term.name.startswith("angle offset"):
-            changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
-            found[term.ratio].append((data.needed(plant.replace(**changed)) - needed) / 1e-3)
+    for term in _drawn_terms(plant, data, options):
+        changed = adjusted_buffers(plant, [term], needed.new_tensor([1e-3]))
+        found[term.ratio].append((data.needed(plant.replace(**changed)) - needed) / 1e-3)
     return found
+
+
+def _drawn_terms(plant: Plant, data: _Data, options: FitOptions) -> list[PlantParameter]:
+    """The terms that a drawing gives: encoder zeros, then those of inertia and gravity."""
+    terms = plant_parameters(plant, driven=data.driven, options=options)
+    zeros = [term for term in terms if term.name.startswith("angle offset")]
+    return [*zeros, *(term for term in terms if term.ratio)]
 
 
 def _unlike_zeros(
@@ -790,16 +796,16 @@ def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[
 
 
 def _with_usual_errors(plant: Plant, given: _Data, options: FitOptions) -> Plant:
-    """The plant with those errors of its terms, within 95 % of their priors, that explain most."""
+    """The plant with its terms changed, each within 95 % of its prior, to explain most torque."""
     from scipy.optimize import lsq_linear  # slow to import
 
-    own = plant_parameters(plant, driven=given.driven, options=options)
-    zeros = [term for term in own if term.name.startswith("angle offset")]
-    terms = [*zeros, *(term for term in own if term.ratio)]
-    slopes = [-slope for part in _torques_of_terms(plant, given, options) for slope in part]
+    terms = _drawn_terms(plant, given, options)
     if not terms:
         return plant
-    left, design, _ = _equations(given, given.tau - given.needed(plant), torch.stack(slopes, -1))
+    zeros, others = _torques_of_terms(plant, given, options)
+    # `_equations` subtracts its extra torques.
+    slopes = -torch.stack(zeros + others, -1)
+    left, design, _ = _equations(given, given.tau - given.needed(plant), slopes)
     rows: Array = torch.cat([design, left[..., None]], -1).flatten(0, 1).numpy()
     if not np.isfinite(rows).all():
         return plant
@@ -828,8 +834,6 @@ def _corrected_torques(
         gain = float(_balance(without, without.tau - given.needed(plant), part)[1])
         if gain and abs(gain - 1) > options.gain_term[0]:
             text = f"{what} {_wrong_by(gain, ' (a unit, torque constant or gear ratio)')}"
-            if gain > 0 and joints == driven:
-                text += ", or all masses and inertias of the rig are wrong by this factor"
             yield text, replace(given, tau=given.tau + (gain - 1) * part)
     needed = given.needed(plant)
     for j in driven:
@@ -1222,15 +1226,13 @@ def _unbalanced(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
 def _cogging(plant: Plant, given: _Data) -> Iterator[tuple[str, float]]:
     """Each driven joint with a torque that repeats with its position, as of a motor's magnets."""
     left, terms, weight = _equations(given, given.tau - given.needed(plant))
-    # Gravity repeats once per turn.
-    slowest = 2 if weighs(plant) else 1
     for j in given.driven if plant.unit == "rad" else ():
         q, known = given.q[:, j], terms[:, j]
         span = float(q.max() - q.min())
         # At least two periods within the motion.
         if not 2 * math.tau < MOST_PER_TURN * span < math.inf:
             continue
-        rates = torch.arange(max(slowest, math.ceil(2 * math.tau / span)), MOST_PER_TURN + 1)
+        rates = torch.arange(math.ceil(2 * math.tau / span), MOST_PER_TURN + 1)
         waves = torch.stack([(q[:, None] * rates).sin(), (q[:, None] * rates).cos()], 2)
         waves = (given.moving[:, [j], None] * given.mean(waves)).movedim(1, 0)
         known = torch.linalg.qr(known[:, known.any(0)]).Q
