@@ -202,8 +202,13 @@ def known(plant: Plant, seed: int, driven: bool) -> Plant:
     kept = [t for t in terms if t.ratio or "angle" in t.name]
     sd = torch.tensor([t.prior_sd for t in kept], dtype=torch.float64)
     random = torch.Generator().manual_seed(seed)
-    off = torch.randn(len(kept), generator=random, dtype=torch.float64).clamp(-2.0, 2.0)
-    return plant.replace(**adjusted_buffers(plant, kept, sd * off))
+    while True:
+        off = torch.randn(len(kept), generator=random, dtype=torch.float64).clamp(-2.0, 2.0)
+        given = plant.replace(**adjusted_buffers(plant, kept, sd * off))
+        # No masses have these inertias otherwise.
+        inertia = getattr(given, "inertia_coupling", None)
+        if inertia is None or torch.linalg.eigvalsh(inertia).min() > 0:
+            return given
 
 
 def recorded(rig: Rig, seed: int) -> list[Recording]:

@@ -147,7 +147,7 @@ def likely_mistakes(
     if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = _unexplained(plant, given)
-    noise = options.diagnosis_ratio * _of_noise(plant, given, given.sd_of_mean)
+    noise = _of_noise(plant, given, given.sd_of_mean)
     # Inertias or torques wrong by the square of a thousand would have the same effect.
     if unit := time_unit(recordings[0].time):
         short, _, rate = unit
@@ -226,6 +226,8 @@ def _above_noise(
     rigs = {mistake.text: mistake for mistake in several}
     most = sound / options.diagnosis_ratio
     found = [rigs.get(text) or Mistake(text, share) for text, share in tested if share < most]
+    if not found and given.driven:
+        found = [*_delay_beside_usual_errors(plant, recordings, motions, given, options)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         # A rig that is wrong in several terms hides a wrong convention.
         both = [
@@ -796,26 +798,47 @@ def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[
 
 
 def _with_usual_errors(plant: Plant, given: _Data, options: FitOptions) -> Plant:
-    """The plant with its terms changed, each within 95 % of its prior, to explain most torque."""
-    from scipy.optimize import lsq_linear  # slow to import
-
+    """The plant with those usual errors of a drawing that explain most torque."""
+    sizes = _balance(given, given.tau - given.needed(plant), *_usual_errors(plant, given, options))[
+        1
+    ]
     terms = _drawn_terms(plant, given, options)
-    if not terms:
-        return plant
-    zeros, others = _torques_of_terms(plant, given, options)
-    # `_equations` subtracts its extra torques.
-    slopes = -torch.stack(zeros + others, -1)
-    left, design, _ = _equations(given, given.tau - given.needed(plant), slopes)
-    rows: Array = torch.cat([design, left[..., None]], -1).flatten(0, 1).numpy()
-    if not np.isfinite(rows).all():
-        return plant
-    # Friction takes energy away.
-    low, high = np.zeros(rows.shape[1] - 1), np.full(rows.shape[1] - 1, np.inf)
-    low[: -given.friction.shape[-1]] = -np.inf
-    high[: len(terms)] = [NORMAL_95 * term.prior_sd for term in terms]
-    low[: len(terms)] = -high[: len(terms)]
-    found = lsq_linear(rows[:, :-1], rows[:, -1], (low, high), method="bvls").x
-    return adjusted_plant(plant, terms, torch.as_tensor(found[: len(terms)]))
+    return adjusted_plant(plant, terms, sizes) if sizes.isfinite().all() else plant
+
+
+def _usual_errors(plant: Plant, data: _Data, options: FitOptions) -> tuple[Tensor, list[float]]:
+    """Torque saved per unit of each drawn term, (sample, joint, term), and 95 % of their priors."""
+    zeros, others = _torques_of_terms(plant, data, options)
+    saved = -torch.stack([*zeros, *others], -1) if zeros or others else data.q[..., None][..., :0]
+    return saved, [NORMAL_95 * term.prior_sd for term in _drawn_terms(plant, data, options)]
+
+
+def _delay_beside_usual_errors(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    given: _Data,
+    options: FitOptions,
+) -> Iterator[Mistake]:
+    """A delay that divides the share which usual errors of the rig leave.
+
+    Beside such errors, the balance of the rig as given hides it.
+    """
+    most, needed = options.largest_delay, given.needed(plant)
+    errors = _usual_errors(plant, given, options)
+
+    def unexplained(data: _Data) -> float:
+        return _share(plant, data, _balance(data, data.tau - needed, *errors)[0])
+
+    if (sound := unexplained(given)) <= _of_noise(plant, given, given.sd_of_mean):
+        return
+    delay, share = _best(
+        lambda x: unexplained(_collect(recordings, motions, options, x)), -most, most
+    )
+    # A torque that is held until the next sample acts up to one step late.
+    held = -max(r.sample_time for r in recordings) <= delay <= 0
+    if not held and options.diagnosis_ratio * share < sound:
+        yield Mistake(delay_in_words(delay), share)
 
 
 def _corrected_torques(
@@ -1383,28 +1406,33 @@ def _share(plant: Plant, data: _Data, target: Tensor) -> float:
     return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
 
 
-def _balance(data: _Data, torque: Tensor, extra: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Mean square of unexplained torque, (joint,), and factors of `extra` torques, (column,)."""
-    from scipy.optimize import nnls  # slow to import
+def _balance(
+    data: _Data, torque: Tensor, extra: Tensor | None = None, most: Sequence[float] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Mean square of unexplained torque, (joint,), and factors of `extra` torques, (column,).
+
+    The factors are at most `most`, of either sign.
+    """
+    from scipy.optimize import lsq_linear  # slow to import
 
     left, terms, weight = _equations(data, torque, extra)
-    # Friction that adds energy is excluded. A factor of either sign is the difference of two
-    # positive ones.
-    free = terms[..., : terms.shape[-1] - data.friction.shape[-1]]
-    design = torch.cat([terms, -free], -1)
-    scaled = design.reshape(-1, design.shape[-1]).numpy()
-    norm = np.linalg.norm(scaled, axis=0)
-    norm[norm == 0] = 1.0
-    rows = np.column_stack([scaled / norm, left.flatten().numpy()])
+    rows: Array = torch.cat([terms, left[..., None]], -1).flatten(0, 1).numpy()
     count = 0 if extra is None else extra.numel() // data.q.numel()
     if not np.isfinite(rows).all():
         return torch.full_like(weight, math.inf), torch.full((count,), math.nan)
+    norm = np.linalg.norm(rows[:, :-1], axis=0)
+    norm[norm == 0] = 1.0
+    high = np.full(len(norm), np.inf)
+    high[:count] = math.inf if most is None else most
+    # Friction that adds energy is excluded.
+    low = -high
+    low[terms.shape[-1] - data.friction.shape[-1] :] = 0.0
     # The triangular factor has the same normal equations.
-    _, factor = np.linalg.qr(rows)
-    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
-    residual = weight * (left - design @ torch.as_tensor(found))
-    factors = found[:count] - found[terms.shape[-1] :][:count]
-    return residual.square().mean(0), torch.as_tensor(factors)
+    factor = np.asarray(np.linalg.qr(rows / np.append(norm, 1.0), mode="r"))
+    bounds = low * norm, high * norm
+    found = lsq_linear(factor[:, :-1], factor[:, -1], bounds, method="bvls").x / norm
+    residual = weight * (left - terms @ torch.as_tensor(found))
+    return residual.square().mean(0), torch.as_tensor(found[:count])
 
 
 def _equations(
@@ -1418,7 +1446,7 @@ def _equations(
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
     own = []
-    if extra is not None:
+    if extra is not None and extra.numel():
         own.append(-data.moving[..., None] * data.mean(extra.reshape(*data.q.shape, -1)))
     # A drive may have an offset.
     offsets = torch.diag_embed(data.moving)[..., data.tau.any(0)]

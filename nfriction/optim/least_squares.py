@@ -13,6 +13,7 @@ Status = Literal[
     "converged_gradient",
     "converged_cost",
     "converged_step",
+    "converged_interval",
     "max_steps",
     "creeping",
     "stalled",
@@ -24,6 +25,7 @@ MESSAGES: dict[str, str] = {
     "converged_gradient": "Converged: the gradient is zero to tolerance, or the residuals are.",
     "converged_cost": "Converged.",
     "converged_step": "Converged: the parameters no longer move.",
+    "converged_interval": "Converged to within the intervals, which include the step that remains.",
     "max_steps": "The step limit was reached; allow more steps.",
     "creeping": "Stalled before reaching a minimum (a kink or a narrow valley in the cost).",
     "stalled": "No step lowers the cost although the gradient is not small: gradient and cost "

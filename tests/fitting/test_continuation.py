@@ -71,6 +71,31 @@ def test_windows_with_accumulated_torque_noise_are_not_needed():
     assert found.warnings == ()
 
 
+def test_stage_that_becomes_the_last_is_searched_to_its_end():
+    """The step limit may end a stage that only starts the next one."""
+    recording, heard = flywheel(1, CVFM(1, [0.35, 0.12]), noise=0.03)[:2000], set()
+    found = fit(
+        CVFM(1), LinearAxis(0.13), recording, windows=(0.5, 2.0), fit_plant=False, max_steps=2,
+        callback=lambda stage, step: heard.add(stage),
+    )  # fmt: skip
+    assert heard == {"0.5 s windows", "2 s windows", "0.5 s windows, continued"}
+    assert found.skipped_horizons == (2.0,)
+    assert found.converged
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_stalled_search_near_the_minimum_has_converged(monkeypatch, steps):
+    monkeypatch.setattr(
+        StallMonitor, "__call__",
+        lambda self, x, local, step: self.costs.append(step.cost)
+        or ("creeping" if len(self.costs) == steps else None),
+    )  # fmt: skip
+    recording = flywheel(1, CVFM(1, [0.35, 0.12]))
+    found = fit(CVFM(1), LinearAxis(0.16), recording, windows=(0.5,))
+    assert found.converged == ("within the intervals" in found.status) == (steps > 1)
+    assert all(i.low < x < i.high for i, x in zip(found.intervals[:2], (0.35, 0.12), strict=True))
+
+
 def short_search(callback=None):
     """A search of one short swing, and its problem."""
     plant, model = pendulum(), LFM(2, [[1e-3, 1e-3]] * 2, v_smooth=0.05)

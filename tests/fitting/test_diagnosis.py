@@ -3,6 +3,7 @@
 import functools
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +31,7 @@ from nfriction.fitting.diagnosis import changing_friction, loose_loads
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
-from nfriction.fitting.strategy import constant
+from nfriction.fitting.strategy import constant, continuation
 from nfriction.fitting.task import prepare_task
 from nfriction.recording.validation import time_unit
 from nfriction.signals import kalman_smoother, quantise
@@ -198,6 +199,15 @@ def test_skipped_windows_of_a_single_free_link_indicate_a_wrong_law(reason, monk
     found = fit("CVFM", rig, swing(rig, truth, start=(1.5,)), windows=(0.5,))
     assert "Windows of 2 s were skipped: law or plant are wrong." in found.warnings
     assert found.usability == ("doubtful", "windows of 2 s were skipped, see warnings")
+
+
+def test_errors_below_the_noise_indicate_no_wrong_law(monkeypatch):
+    """Longer windows may show such errors, as those of the integration."""
+    monkeypatch.setattr(continuation, "loses", lambda *_: True)
+    rig, truth = one_link(), CVFM(1, [[8e-3, 2e-3]]).requires_grad_(False)
+    found = fit("CVFM", rig, swing(rig, truth), windows=(0.5, 2.0))
+    assert "Windows of 2 s were not needed: over them errors below the encoder's" in found.status
+    assert found.usability == ("good", "")
 
 
 @pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])
@@ -745,6 +755,25 @@ def test_advanced_torque_is_aligned_again():
         Recording(late.time, q).advance_torque(0.01)
 
 
+def off_as_drawings_are(plant: Plant, seed: int, driven: Sequence[int] = ()) -> Plant:
+    """The plant with an error of a drawing in every term."""
+    terms = plant_parameters(plant, driven=[*driven])
+    terms = [term for term in terms if term.ratio or term.name.startswith("angle offset")]
+    draw = torch.Generator().manual_seed(seed)
+    sizes = torch.randn(len(terms), generator=draw, dtype=torch.float64).clamp(-1.9, 1.9)
+    usual = torch.tensor([term.prior_sd for term in terms], dtype=torch.float64)
+    return adjusted_plant(plant, terms, sizes * usual)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 5])
+def test_delay_is_named_beside_errors_of_a_drawing(seed):
+    plant, q, tau = measured("driven")
+    drawn = off_as_drawings_are(plant, seed, driven=(0, 1))
+    assert not any("later than" in w for w in warnings_of(drawn, q, tau))
+    (text,) = (w for w in warnings_of(drawn, q, later(tau, 15)) if "later than positions" in w)
+    assert 0.025 < float(text.split(" ms later")[0].split()[-1]) / 1e3 < 0.032
+
+
 @pytest.mark.parametrize("seed", [4, 13])
 def test_errors_of_a_drawing_are_no_gain_of_energy(seed):
     """The energy of a free swing rises if it is computed with slightly wrong terms."""
@@ -752,11 +781,7 @@ def test_errors_of_a_drawing_are_no_gain_of_energy(seed):
     plant = PendulumChain(**links, inertia=[2e-3, 3e-3, 2e-3])
     truth = CVFM(3, [[0.02, 1e-3], [0.012, 1e-3], [0.006, 1e-3]])
     recording = swing(plant, truth, seconds=6.0, start=(2.2, 1.0, 0.8))
-    terms = plant_parameters(plant, driven=[])
-    draw = torch.Generator().manual_seed(seed)
-    sizes = torch.randn(len(terms), generator=draw, dtype=torch.float64).clamp(-1.9, 1.9)
-    usual = torch.tensor([term.prior_sd for term in terms], dtype=torch.float64)
-    wrong = adjusted_plant(plant, terms, sizes * usual)
+    wrong = off_as_drawings_are(plant, seed)
     assert not any("gains energy" in w for w in warnings_of(wrong, recording.q, None))
     reverse = np.ascontiguousarray(recording.q[::-1])
     assert any("gains energy" in w for w in warnings_of(wrong, reverse, None))

@@ -133,9 +133,14 @@ def result_from_shooting(
     outliers = tuple(outliers_of(problem, weights))
     noise = uncertainty.measurement_noise(problem, x, residual)
     limit = problem.options.model_error_ratio
+    rest = _remaining_step(problem, result)
     intervals, unidentifiable, root = _identifiability(
-        problem, result, names, residuals * weights, motions, ambiguous
+        problem, result, names, residuals * weights, motions, ambiguous, rest
     )
+    ended = result.status in ("max_steps", "creeping", "stalled")
+    noticed = problem.options.explained_ratio
+    if ended and root is not None and _near_minimum(result, rest, root, noticed):
+        result = replace(result, status="converged_interval")
     ends = {name: (float(a), float(b)) for name, a, b in zip(names, lower, upper, strict=True)}
     # Their bound is a matter of chance.
     vague = {i.name for i in intervals if i.low <= ends[i.name][0] and i.high >= ends[i.name][1]}
@@ -389,14 +394,16 @@ def _identifiability(
     residuals: Tensor,
     motions: Sequence[Motion],
     ambiguous: Sequence[str],
+    rest: Tensor,
 ) -> tuple[tuple[Interval, ...], tuple[str, ...], Tensor | None]:
     """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
     With a network only plant terms have intervals, and no parameter counts as unidentifiable.
+    `rest` is the step that remains to the minimum, a further error like that of integration.
     """
     constant = not problem.friction.schedule.follows_motion
     if (belief := problem.friction.schedule.belief()) is None:
-        off = uncertainty.integration_error(problem, result)
+        off = torch.stack([uncertainty.integration_error(problem, result), rest.nan_to_num(0.0)], 1)
     else:
         problem, off = _by_data(problem, result.x, belief)
     variables, options = problem.variables, problem.options
@@ -414,8 +421,9 @@ def _identifiability(
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
     known = uncertainty.gathered_information(problem, result.x, sd, quantum if rounded else None)
     known = known.subset(fitted)
-    root = torch.zeros(count, len(fitted) + 1, dtype=torch.float64)
-    root[fitted] = torch.cat([identifiability.covariance_root(known), off[fitted, None]], 1)
+    own = torch.cat([identifiability.covariance_root(known), off[fitted]], 1)
+    root = own.new_zeros(count, own.shape[1])
+    root[fitted] = own
     root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
@@ -457,12 +465,28 @@ def _by_data(
     problem = replace(problem, friction_prior=(mean, wide), extrapolation=None)
     local = problem.linearise(x)
     lower, upper = problem.variables.bounds()
-    free = (lower < upper).nonzero().flatten()
-    step, failed = torch.linalg.solve_ex(local.hessian[free][:, free], local.gradient[free])
-    off = torch.zeros_like(x)
-    if not failed and step.isfinite().all():
-        off[free] = step
-    return problem, off
+    off = uncertainty.full_step(local.hessian, local.gradient, lower < upper)
+    return problem, off.nan_to_num(0.0)[:, None]
+
+
+def _remaining_step(problem: ShootingProblem, result: LeastSquaresResult) -> Tensor:
+    """Step from the end of a search to the minimum of its quadratic, zero if it converged."""
+    if result.converged:
+        return torch.zeros_like(result.x)
+    lower, upper = problem.variables.bounds()
+    free = (lower < upper) & ~(result.at_lower | result.at_upper)
+    return uncertainty.full_step(result.hessian, result.gradient, free)
+
+
+def _near_minimum(result: LeastSquaresResult, rest: Tensor, root: Tensor, noticed: float) -> bool:
+    """True if the remaining step is within the intervals and hardly lowers the residual.
+
+    That is, it changes each friction parameter by at most one standard deviation without this step.
+    These are also large at a large residual, so the step must not divide the residual by `noticed`.
+    """
+    saved = -float(result.gradient @ rest + 0.5 * rest @ (result.hessian @ rest))
+    small = 2.0 * rest[: len(root)].square() <= root.square().sum(1)
+    return saved <= (1.0 - noticed**-2) * result.cost and bool(small.all())
 
 
 def _torque_scale(

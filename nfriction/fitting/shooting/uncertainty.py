@@ -186,7 +186,6 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
         # Its hidden state advances with samples, as in a controller: finer steps make another one.
         return torch.zeros_like(x)
     lower, upper = variables.bounds()
-    free = (lower < upper).nonzero().flatten()
     finer = replace(problem, substeps=FINER * problem.substeps)
     # A free motion hardly rests, and may amplify so large a change beyond any linear response.
     if problem.windows.tau.any() or problem.substeps >= problem.options.max_substeps:
@@ -198,10 +197,15 @@ def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> T
     rows = problem.rows(run, problem.scale * weight.sqrt())
     scaled = off * problem.scale * weight.sqrt()
     gradient, _ = normal.normal_equations(rows, scaled, variables.indices(), len(x))
-    step, failed = torch.linalg.solve_ex(result.hessian[free][:, free], -gradient[free])
-    moved = torch.zeros_like(x)
-    if not failed and step.isfinite().all():
-        moved[free] = step
+    return full_step(result.hessian, gradient, lower < upper).nan_to_num(0.0)
+
+
+def full_step(hessian: Tensor, gradient: Tensor, free: Tensor) -> Tensor:
+    """Undamped step to the minimum of a quadratic in its free variables; NaN if there is none."""
+    at = free.nonzero().flatten()
+    step, failed = torch.linalg.solve_ex(hessian[at][:, at], -gradient[at])
+    moved = torch.zeros_like(gradient)
+    moved[at] = step if not failed and step.isfinite().all() else torch.nan
     return moved
 
 

@@ -111,7 +111,8 @@ def fit_constant(task: FitTask) -> FitResult:
     why = "law or plant are wrong" if wrong else why
     said = [f"{skipped} were skipped: {why}."] if why else []
     if search.reason == "noisy":
-        noisy = f"{skipped} were not needed: over them noise of the torque adds up"
+        adding = "noise of the torque adds" if driven else "errors below the encoder's noise add"
+        noisy = f"{skipped} were not needed: over them {adding} up"
         fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")
     if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))

@@ -35,6 +35,8 @@ from nfriction.signals import Motion
 # Coefficients (joint, coefficient) that torques imply for a plant: the best, then the best for each
 # of the law's initial values.
 EquationError = Callable[[Plant], Iterable[Tensor]]
+# Why longer windows were skipped.
+Reason = Literal["", "too long", "lossy", "noisy"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +229,7 @@ class Continuation:
 
     stages: tuple[HorizonResult, ...]  # those that were kept, at least one
     skipped: tuple[float, ...] = ()  # lengths of the windows that were skipped [s]
-    reason: Literal["", "too long", "lossy", "noisy"] = ""  # of the first; empty if stopped
+    reason: Reason = ""  # of the first; empty if stopped
 
     @property
     def end(self) -> HorizonResult:
@@ -265,6 +267,8 @@ def horizon_continuation(
     stages: list[HorizonResult] = []
     offsets: Tensor | None = None
     noise, simulated = options.first_noise, motions
+    skipped: tuple[float, ...] = ()
+    reason: Reason = ""
     for place, length in enumerate(options.windows):
         rest, last = tuple(options.windows[place:]), place + 1 == len(options.windows)
         problem = fitter.problem(fitter.cut(simulated, length, motions), noise, friction)
@@ -289,11 +293,14 @@ def horizon_continuation(
             )
             ends = [other, found] if other is not found else ends
         if stages and ends[0].lost_motion(stages[-1], options):
-            return Continuation(tuple(stages), rest, "too long")
+            skipped, reason = rest, "too long"
+            break
         kept = [end for end in ends if not stages or end.stopped or not loses(stages, end)]
         if not kept:
-            noisy = all(knows_less(end, stages[-1]) for end in ends)
-            return Continuation(tuple(stages), rest, "noisy" if noisy else "lossy")
+            # Errors that noise hides are no reason to doubt law or plant.
+            noisy = all(end.explained or knows_less(end, stages[-1]) for end in ends)
+            skipped, reason = rest, "noisy" if noisy else "lossy"
+            break
         found = kept[0]
         if fitter.friction.law.memory and not (found.stopped or found.result.converged):
             # Sensitive contacts at the start raise the damping, which then keeps steps short.
@@ -304,7 +311,13 @@ def horizon_continuation(
         if found.stopped:
             break
         simulated = found.problem.simulated_motions(found.result.x, simulated)
-    return Continuation(tuple(stages))
+    end = stages[-1]
+    if skipped and end.result.status == "max_steps":
+        # The step limit ended a stage that was only to start the next one.
+        tolerance = loglik_tolerance(end.result.cost, options)
+        name = f"{end.problem.windows.length:g} s windows{of}, continued"
+        stages[-1] = fitter.search(end.problem, end.result.x, tolerance, name)
+    return Continuation(tuple(stages), skipped, reason)
 
 
 def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
