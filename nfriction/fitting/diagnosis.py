@@ -65,6 +65,14 @@ class Mistake:
     timed: bool = False  # a wrong sample rate would explain the same
 
 
+class _Correction(NamedTuple):
+    """A correction of one mistake, and the share of the torque that it leaves unexplained [-]."""
+
+    text: str
+    share: float
+    case: "tuple[Plant, _Data] | None" = None  # corrected, if only these change
+
+
 @dataclass(frozen=True)
 class _Data:
     """Samples in joint coordinates, (sample, joint) each, in blocks of equal length.
@@ -205,16 +213,21 @@ def _above_noise(
         else:
             text = f"{term.name} is {1 + x:.3g} times that of the rig"
             if plant.joints == 1 and term.name.startswith("inertia"):
-                text += f", or the true sample rate is {math.sqrt(1 + x):.3g} times that in `time`"
+                rate = math.sqrt(_inertia(rig) / _inertia(plant))
+                text += f", or the true sample rate is {rate:.3g} times that in `time`"
             # Without a drive, a guessed inertia is likelier than a missing rotor.
-            tested.insert(len(tested) if given.driven else 0, (text, share))
+            place = len(tested) if given.driven else 0
+            tested.insert(place, _Correction(text, share, (rig, given)))
     if sound <= noise:
         return []
     if len(recordings) > 1:
         most = min(sound, zeros) / options.diagnosis_ratio
-        tested += _odd_one_out(plant, recordings, motions, convention, most, options)
+        odd = _odd_one_out(plant, recordings, motions, convention, most, options)
+        tested += (_Correction(*x) for x in odd)
+    most = sound / options.diagnosis_ratio
+    tested = _allowing_usual_errors(tested, plant, most, options)
     # Near one position a spring is like gravity, and a ratio like a unit.
-    least = min((share for _, share in tested), default=math.inf)
+    least = min((x.share for x in tested), default=math.inf)
     several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
@@ -222,10 +235,9 @@ def _above_noise(
     rare += [_wrong_rate(plant, given), *((each.text, each.unexplained) for each in several)]
     if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
         rare += _cogging(plant, given)
-    tested += [x for x in rare if options.diagnosis_tie * x[1] < least]
+    tested += [_Correction(*x) for x in rare if options.diagnosis_tie * x[1] < least]
     rigs = {mistake.text: mistake for mistake in several}
-    most = sound / options.diagnosis_ratio
-    found = [rigs.get(text) or Mistake(text, share) for text, share in tested if share < most]
+    found = [rigs.get(x.text) or Mistake(x.text, x.share) for x in tested if x.share < most]
     if not found and given.driven:
         found = [*_delay_beside_usual_errors(plant, recordings, motions, given, options)]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
@@ -438,24 +450,55 @@ def _tested(
     options: FitOptions,
     delay: tuple[float, float],
     stated: float,
-) -> Iterator[tuple[str, float]]:
+) -> Iterator[_Correction]:
     for text, data in _corrected_positions(plant, convention, given):
-        yield text, _unexplained(plant, data)
+        yield _corrected(text, plant, data)
     for text, rig in _corrected_rigs(plant, bool(given.tau.any())):
-        yield text, _unexplained(rig, given)
+        yield _corrected(text, rig, given)
     if given.tau.any():
-        for text, data in _corrected_torques(plant, given, options):
-            yield text, _unexplained(plant, data)
-        yield delay_in_words(delay[0]), delay[1]
-        yield _drifting_clock(plant, recordings, motions, options)
         drives = *_saturated(plant, given), *_switched_off(plant, recordings, given)
-        for text, data in drives:
-            yield text, _unexplained(plant, data)
+        for text, data in (*_corrected_torques(plant, given, options), *drives):
+            yield _corrected(text, plant, data)
+        yield _Correction(delay_in_words(delay[0]), delay[1])
+        yield _Correction(*_drifting_clock(plant, recordings, motions, options))
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
         if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
-            yield from _elastic(plant, given, recordings[0].sample_time)
+            for text, share in _elastic(plant, given, recordings[0].sample_time):
+                yield _Correction(text, share)
     for text, rig in (*_missing_rotors(plant, given, options), *_payloads(plant, given, options)):
-        yield text, _unexplained(rig, given)
+        yield _corrected(text, rig, given)
+
+
+def _inertia(plant: Plant) -> float:
+    """Inertia of a single joint with that of its rotor [kg m^2; kg]."""
+    rest = torch.zeros(1, plant.joints, dtype=torch.float64)
+    accelerated, held = (plant.inverse_dynamics(rest, rest, rest + k) for k in (1.0, 0.0))
+    return float((accelerated - held)[0, -1])
+
+
+def _corrected(text: str, rig: Plant, data: _Data) -> _Correction:
+    return _Correction(text, _unexplained(rig, data), (rig, data))
+
+
+def _allowing_usual_errors(
+    tested: Sequence[_Correction], plant: Plant, most: float, options: FitOptions
+) -> list[_Correction]:
+    """The corrections; the best of data and of rig with what they leave of a rig as drawn.
+
+    Otherwise rare mistakes, whose factors absorb usual errors of the rig, would explain more. Which
+    is best depends on the rig as given, because such errors make corrections alike.
+    """
+    found = []
+    for of in tested:
+        if of.case and of.share < most:
+            rig, data = of.case
+            peers = [x.share for x in tested if x.case and (x.case[0] is plant) == (rig is plant)]
+            if of.share <= options.diagnosis_tie * min(peers):
+                torque = data.tau - data.needed(rig)
+                left, _ = _balance(data, torque, *_usual_errors(rig, data, options))
+                of = of._replace(share=min(of.share, _share(rig, data, left)))
+        found.append(of)
+    return found
 
 
 def _odd_one_out(
@@ -735,14 +778,17 @@ def _missing_rotors(plant: Plant, given: _Data, options: FitOptions) -> Iterator
 
 def _payloads(plant: Plant, given: _Data, options: FitOptions) -> Iterator[tuple[str, Plant]]:
     """Each link with a mass at its end, unless the fit corrects its effects by itself."""
-    own, gravity = dict(plant.named_buffers()), plant.to_dict().get("gravity")
+    own, drawn = dict(plant.named_buffers()), plant.to_dict()
+    gravity = drawn.get("gravity")
     if not (isinstance(plant, PendulumChain) and gravity) or plant.first_link:
         return
     for k, name in enumerate(plant.joint_names):
         reach = torch.where(torch.arange(plant.joints) <= k, plant.length, 0.0)
         unit = {"inertia_coupling": torch.outer(reach, reach), "gravity_moment": gravity * reach}
         mass, (bound, _) = _amount(plant, unit, given), options.ratio_term
-        if mass > 0 and any((mass * part > bound * own[key]).any() for key, part in unit.items()):
+        seen = any((mass * part > bound * own[key]).any() for key, part in unit.items())
+        # No arm carries more than itself.
+        if seen and 0 < mass < sum(drawn["mass"]):
             rig = plant.replace(**{key: own[key] + mass * part for key, part in unit.items()})
             text = f"the link of {name} carries {mass:.3g} kg at its end that the rig lacks"
             yield f"{text} (`mass`, `com` and `inertia`)", rig

@@ -795,6 +795,18 @@ def test_wrong_sample_rate_of_a_single_link_is_named_beside_its_inertia():
     assert "or the true sample rate is 2" in text
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_mistakes_are_named_beside_errors_of_a_drawing(seed):
+    """Wrong terms of the rig would absorb both the mistake and these errors."""
+    plant, q, tau = measured("motor")
+    drawn = off_as_drawings_are(plant, seed, driven=(0,))
+    assert not any("likely" in w for w in warnings_of(drawn, q, tau))
+    (unit, *_) = warnings_of(drawn, q, 1e3 * tau)
+    assert 850 < float(re.findall(r"torque of joint1 is (\S+) times too large", unit)[0]) < 1150
+    (rate, *_) = warnings_of(drawn, q, tau, time=2 * STEP * np.arange(SAMPLES))
+    assert 1.8 < float(re.findall(r"true sample rate is (\S+) times", rate)[0]) < 2.2
+
+
 @pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
 def test_a_driven_motion_without_torque_is_named(name):
     plant, q, _ = measured(name)
