@@ -44,8 +44,12 @@ ALIKE = 0.1
 LOG_RATIOS = math.log(1.5), math.log(300.0)
 # Cogging repeats with the least common multiple of slots and poles, at most about this.
 MOST_PER_TURN = 300
+# Heavier loads, in masses of the links, are mistakes in a unit.
+MOST_PAYLOAD = 100.0
 # Linear solutions for terms that multiply each other; their error is squared each time.
 SOLUTIONS = 5
+# Ridge of a balance, relative to the length of its columns: far above round-off, below any noise.
+RIDGE = 1e-8
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -70,7 +74,7 @@ class _Correction(NamedTuple):
 
     text: str
     share: float
-    case: "tuple[Plant, _Data] | None" = None  # corrected, if only these change
+    case: "tuple[Plant, _Data] | None" = None  # corrected; None if more than these change
 
 
 @dataclass(frozen=True)
@@ -225,9 +229,8 @@ def _above_noise(
         odd = _odd_one_out(plant, recordings, motions, convention, most, options)
         tested += (_Correction(*x) for x in odd)
     most = sound / options.diagnosis_ratio
-    tested = _allowing_usual_errors(tested, plant, most, options)
     # Near one position a spring is like gravity, and a ratio like a unit.
-    least = min((x.share for x in tested), default=math.inf)
+    least = _with_usual_errors_too(tested, plant, most, options)
     several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
@@ -456,11 +459,12 @@ def _tested(
     for text, rig in _corrected_rigs(plant, bool(given.tau.any())):
         yield _corrected(text, rig, given)
     if given.tau.any():
-        drives = *_saturated(plant, given), *_switched_off(plant, recordings, given)
-        for text, data in (*_corrected_torques(plant, given, options), *drives):
+        for text, data in _corrected_torques(plant, given, options):
             yield _corrected(text, plant, data)
         yield _Correction(delay_in_words(delay[0]), delay[1])
         yield _Correction(*_drifting_clock(plant, recordings, motions, options))
+        for text, data in (*_saturated(plant, given), *_switched_off(plant, recordings, given)):
+            yield _corrected(text, plant, data)
         # Narrow-band noise of the smoothed accelerations has a resonance of its own.
         if options.diagnosis_ratio * _of_noise(plant, given, given.sd) < stated:
             for text, share in _elastic(plant, given, recordings[0].sample_time):
@@ -480,25 +484,24 @@ def _corrected(text: str, rig: Plant, data: _Data) -> _Correction:
     return _Correction(text, _unexplained(rig, data), (rig, data))
 
 
-def _allowing_usual_errors(
+def _with_usual_errors_too(
     tested: Sequence[_Correction], plant: Plant, most: float, options: FitOptions
-) -> list[_Correction]:
-    """The corrections; the best of data and of rig with what they leave of a rig as drawn.
+) -> float:
+    """Smallest share that a correction leaves if the rig also has usual errors of a drawing.
 
-    Otherwise rare mistakes, whose factors absorb usual errors of the rig, would explain more. Which
-    is best depends on the rig as given, because such errors make corrections alike.
+    Rare mistakes have to explain more than this, because their factors absorb such errors. Only the
+    best corrections of the data and of the rig count, as the errors make all of them alike.
     """
-    found = []
-    for of in tested:
-        if of.case and of.share < most:
-            rig, data = of.case
+    shares = [math.inf, *(x.share for x in tested)]
+    for share, case in ((x.share, x.case) for x in tested if x.share < most):
+        if case is not None:
+            rig, data = case
             peers = [x.share for x in tested if x.case and (x.case[0] is plant) == (rig is plant)]
-            if of.share <= options.diagnosis_tie * min(peers):
+            if share <= options.diagnosis_tie * min(peers):
                 torque = data.tau - data.needed(rig)
                 left, _ = _balance(data, torque, *_usual_errors(rig, data, options))
-                of = of._replace(share=min(of.share, _share(rig, data, left)))
-        found.append(of)
-    return found
+                shares.append(_share(rig, data, left))
+    return min(shares)
 
 
 def _odd_one_out(
@@ -548,6 +551,8 @@ def _torques_of_terms(
 def _drawn_terms(plant: Plant, data: _Data, options: FitOptions) -> list[PlantParameter]:
     """The terms that a drawing gives: encoder zeros, then those of inertia and gravity."""
     terms = plant_parameters(plant, driven=data.driven, options=options)
+    # Terms without a spread are exact.
+    terms = [term for term in terms if term.prior_sd > 0]
     zeros = [term for term in terms if term.name.startswith("angle offset")]
     return [*zeros, *(term for term in terms if term.ratio)]
 
@@ -730,6 +735,10 @@ def _corrected_rigs(plant: Plant, driven: bool) -> Iterator[tuple[str, Plant]]:
         remedy = "`gravity`: 1e-6" if "gravity" in given else "no `mass`"
         text = f"torques show no gravity: joints turn in a horizontal plane ({remedy}), or a"
         mistakes[f"{text} controller compensates it with torques that are not recorded"] = none
+    # Of a horizontal rig, at most that of a small tilt.
+    if 0 < (level := given.get("gravity", 0.0)) < 0.01:
+        text = "the motion shows gravity: joints turn in a vertical plane (`gravity`: 9.81)"
+        mistakes[text] = {"gravity": 9.81 / level}
     mistakes |= {
         "masses are in g": {"mass": 1e-3},
         "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
@@ -787,8 +796,7 @@ def _payloads(plant: Plant, given: _Data, options: FitOptions) -> Iterator[tuple
         unit = {"inertia_coupling": torch.outer(reach, reach), "gravity_moment": gravity * reach}
         mass, (bound, _) = _amount(plant, unit, given), options.ratio_term
         seen = any((mass * part > bound * own[key]).any() for key, part in unit.items())
-        # No arm carries more than itself.
-        if seen and 0 < mass < sum(drawn["mass"]):
+        if seen and 0 < mass < MOST_PAYLOAD * sum(drawn["mass"]):
             rig = plant.replace(**{key: own[key] + mass * part for key, part in unit.items()})
             text = f"the link of {name} carries {mass:.3g} kg at its end that the rig lacks"
             yield f"{text} (`mass`, `com` and `inertia`)", rig
@@ -845,10 +853,8 @@ def _several_terms(plant: Plant, given: _Data, options: FitOptions) -> Iterator[
 
 def _with_usual_errors(plant: Plant, given: _Data, options: FitOptions) -> Plant:
     """The plant with those usual errors of a drawing that explain most torque."""
-    sizes = _balance(given, given.tau - given.needed(plant), *_usual_errors(plant, given, options))[
-        1
-    ]
-    terms = _drawn_terms(plant, given, options)
+    terms, errors = _drawn_terms(plant, given, options), _usual_errors(plant, given, options)
+    _, sizes = _balance(given, given.tau - given.needed(plant), *errors)
     return adjusted_plant(plant, terms, sizes) if sizes.isfinite().all() else plant
 
 
@@ -868,7 +874,7 @@ def _delay_beside_usual_errors(
 ) -> Iterator[Mistake]:
     """A delay that divides the share which usual errors of the rig leave.
 
-    Beside such errors, the balance of the rig as given hides it.
+    The balance of the rig as given hides a delay beside such errors.
     """
     most, needed = options.largest_delay, given.needed(plant)
     errors = _usual_errors(plant, given, options)
@@ -884,7 +890,7 @@ def _delay_beside_usual_errors(
     # A torque that is held until the next sample acts up to one step late.
     held = -max(r.sample_time for r in recordings) <= delay <= 0
     if not held and options.diagnosis_ratio * share < sound:
-        yield Mistake(delay_in_words(delay), share)
+        yield Mistake(f"{delay_in_words(delay)}, beside usual errors of the rig", share)
 
 
 def _corrected_torques(
@@ -1457,7 +1463,7 @@ def _balance(
 ) -> tuple[Tensor, Tensor]:
     """Mean square of unexplained torque, (joint,), and factors of `extra` torques, (column,).
 
-    The factors are at most `most`, of either sign.
+    The magnitude of each factor is at most `most`.
     """
     from scipy.optimize import lsq_linear  # slow to import
 
@@ -1473,12 +1479,16 @@ def _balance(
     # Friction that adds energy is excluded.
     low = -high
     low[terms.shape[-1] - data.friction.shape[-1] :] = 0.0
-    # The triangular factor has the same normal equations.
-    factor = np.asarray(np.linalg.qr(rows / np.append(norm, 1.0), mode="r"))
-    bounds = low * norm, high * norm
-    found = lsq_linear(factor[:, :-1], factor[:, -1], bounds, method="bvls").x / norm
-    residual = weight * (left - terms @ torch.as_tensor(found))
-    return residual.square().mean(0), torch.as_tensor(found[:count])
+    # The triangular factor has the same normal equations. Columns may be equal, as those of an
+    # offset and of dry friction in one direction: without a ridge, their factors would diverge.
+    rows = np.vstack([rows / np.append(norm, 1.0), np.eye(len(norm), len(norm) + 1) * RIDGE])
+    factor = np.asarray(np.linalg.qr(rows, mode="r"))
+    found = lsq_linear(
+        factor[:, :-1], factor[:, -1], (low * norm, high * norm), method="bvls",
+        max_iter=50 * len(norm),
+    )  # fmt: skip
+    factors = torch.as_tensor(found.x / norm)
+    return (weight * (left - terms @ factors)).square().mean(0), factors[:count]
 
 
 def _equations(

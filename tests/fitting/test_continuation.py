@@ -83,6 +83,23 @@ def test_stage_that_becomes_the_last_is_searched_to_its_end():
     assert found.converged
 
 
+def test_search_that_the_caller_stops_is_not_continued(monkeypatch):
+    monkeypatch.setattr(continuation.HorizonResult, "lost_motion", lambda *_: True)
+    recording, heard = flywheel(1, CVFM(1, [0.35, 0.12]), noise=0.03)[:2000], []
+
+    def stop(stage, step):
+        heard.append(stage)
+        return stage == "2 s windows"
+
+    found = fit(
+        CVFM(1), LinearAxis(0.13), recording, windows=(0.5, 2.0), fit_plant=False, max_steps=2,
+        callback=stop,
+    )  # fmt: skip
+    assert heard == ["0.5 s windows", "0.5 s windows", "2 s windows"]
+    assert not found.converged
+    assert "Stopped" in found.status
+
+
 @pytest.mark.parametrize("steps", [1, 4])
 def test_stalled_search_near_the_minimum_has_converged(monkeypatch, steps):
     monkeypatch.setattr(

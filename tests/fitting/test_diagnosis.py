@@ -596,6 +596,33 @@ def test_torques_without_gravity_are_named(name, remedy):
     assert f"torques show no gravity: joints turn in a horizontal plane ({remedy})" in first
 
 
+@pytest.mark.parametrize("bob", [0.05, 1.0])
+def test_weight_at_the_end_of_a_light_rod_is_named(bob):
+    rod = {"mass": [0.1], "length": [0.4], "com": [0.2], "inertia": [0.1 * 0.4**2 / 12]}
+    mass = 0.1 + bob
+    com = (0.1 * 0.2 + bob * 0.4) / mass
+    inertia = rod["inertia"][0] + 0.1 * (com - 0.2) ** 2 + bob * (0.4 - com) ** 2
+    whole = PendulumChain([mass], [0.4], com=[com], inertia=[inertia])
+    tau = torque([0.3 * 9.81 * mass * com], 3)
+    rest = torch.tensor([math.pi], dtype=torch.float64)
+    model = CVFM(1, [[0.02, 0.005]]).requires_grad_(False)
+    found = rollout(
+        whole, model, rest, 0 * rest, torch.as_tensor(tau[:-1]), sample_time=STEP,
+        steps=SAMPLES - 1, substeps=8,
+    )  # fmt: skip
+    (first, *_) = warnings_of(PendulumChain(**rod), quantise(found.q.numpy(), 4096), tau)
+    (named,) = re.findall(r"likely: the link of joint1 carries (\S+) kg at its end", first)
+    assert float(named) == pytest.approx(bob, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["free", "driven"])
+def test_vertical_rig_given_as_horizontal_is_named(name):
+    _, q, tau = measured(name)
+    (first, *_) = warnings_of(PendulumChain(**DOUBLE, gravity=1e-6), q, tau)
+    assert "the motion shows gravity: joints turn in a vertical plane" in first
+    assert "gains energy" not in first
+
+
 @pytest.mark.parametrize(("name", "stiffness"), [("axis", 40.0), ("wheel", 1.5)])
 def test_spring_missing_in_the_rig_is_named(name, stiffness):
     plant, q, tau = measured(name)

@@ -399,7 +399,8 @@ def _identifiability(
     """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
     With a network only plant terms have intervals, and no parameter counts as unidentifiable.
-    `rest` is the step that remains to the minimum, a further error like that of integration.
+    `rest` is the step that remains to the minimum, a further error like that of integration; a
+    network has another one, `_by_data`.
     """
     constant = not problem.friction.schedule.follows_motion
     if (belief := problem.friction.schedule.belief()) is None:
@@ -474,15 +475,16 @@ def _remaining_step(problem: ShootingProblem, result: LeastSquaresResult) -> Ten
     if result.converged:
         return torch.zeros_like(result.x)
     lower, upper = problem.variables.bounds()
-    free = (lower < upper) & ~(result.at_lower | result.at_upper)
-    return uncertainty.full_step(result.hessian, result.gradient, free)
+    slope = result.gradient
+    held = (result.at_lower & (slope > 0)) | (result.at_upper & (slope < 0))
+    return uncertainty.full_step(result.hessian, slope, (lower < upper) & ~held)
 
 
 def _near_minimum(result: LeastSquaresResult, rest: Tensor, root: Tensor, noticed: float) -> bool:
     """True if the remaining step is within the intervals and hardly lowers the residual.
 
-    That is, it changes each friction parameter by at most one standard deviation without this step.
-    These are also large at a large residual, so the step must not divide the residual by `noticed`.
+    It changes each friction parameter by at most one standard deviation, which excludes this step.
+    Intervals are also wide if the residual is large, so the step must not divide it by `noticed`.
     """
     saved = -float(result.gradient @ rest + 0.5 * rest @ (result.hessian @ rest))
     small = 2.0 * rest[: len(root)].square() <= root.square().sum(1)

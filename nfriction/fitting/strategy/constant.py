@@ -114,7 +114,7 @@ def fit_constant(task: FitTask) -> FitResult:
         adding = "noise of the torque adds" if driven else "errors below the encoder's noise add"
         noisy = f"{skipped} were not needed: over them {adding} up"
         fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")
-    if driven and found.result.converged and not (options.fit_delay or task.mistakes):
+    if driven and fitted.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
         rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
         delayed = _fitter(with_delay, model, torque, eccentric or rich)

@@ -293,6 +293,8 @@ def horizon_continuation(
             )
             ends = [other, found] if other is not found else ends
         if stages and ends[0].lost_motion(stages[-1], options):
+            if found.stopped:
+                return Continuation((*stages[:-1], stages[-1].as_stopped()), rest)
             skipped, reason = rest, "too long"
             break
         kept = [end for end in ends if not stages or end.stopped or not loses(stages, end)]
@@ -365,7 +367,8 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     for at in (*stages, found):
         new = _squares(at, found)
         if at is not found and at.explained:
-            lost = float(new.sum() - at.residuals.square().sum()) / at.noise**2
+            noise = max(at.noise, found.problem.options.min_noise)
+            lost = float(new.sum() - at.residuals.square().sum()) / noise**2
             if not lost <= float(chdtri(fitted, chance)):
                 return True
         elif not new.isfinite().all():
