@@ -70,7 +70,7 @@ def test_unconverged_fit_is_not_recommended_for_export(
     bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(tmp_path / "m.json")]
-    words = ["fit", str(bench / "a.csv.gz"), *rig, *QUICK, "--max-steps", "1"]
+    words = ["fit", str(bench / "a.csv.gz"), *rig, *QUICK, "--max-steps", "0"]
     assert cli.main(words) == 0
     output = capsys.readouterr().out
     assert "LFM: doubtful (the search did not converge). Not converged" in output
