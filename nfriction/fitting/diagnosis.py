@@ -230,7 +230,7 @@ def _above_noise(
         tested += (_Correction(*x) for x in odd)
     most = sound / options.diagnosis_ratio
     # Near one position a spring is like gravity, and a ratio like a unit.
-    least = _with_usual_errors_too(tested, plant, most, options)
+    least = _least_with_usual_errors(tested, plant, most, options)
     several = [*_several_terms(plant, given, options)]
     springs = () if presliding else _springs(plant, given)
     rare = [*springs, *_unbalanced(plant, given), *_geared(plant, convention, given)]
@@ -484,7 +484,7 @@ def _corrected(text: str, rig: Plant, data: _Data) -> _Correction:
     return _Correction(text, _unexplained(rig, data), (rig, data))
 
 
-def _with_usual_errors_too(
+def _least_with_usual_errors(
     tested: Sequence[_Correction], plant: Plant, most: float, options: FitOptions
 ) -> float:
     """Smallest share that a correction leaves if the rig also has usual errors of a drawing.
@@ -493,14 +493,13 @@ def _with_usual_errors_too(
     best corrections of the data and of the rig count, as the errors make all of them alike.
     """
     shares = [math.inf, *(x.share for x in tested)]
-    for share, case in ((x.share, x.case) for x in tested if x.share < most):
-        if case is not None:
-            rig, data = case
-            peers = [x.share for x in tested if x.case and (x.case[0] is plant) == (rig is plant)]
-            if share <= options.diagnosis_tie * min(peers):
-                torque = data.tau - data.needed(rig)
-                left, _ = _balance(data, torque, *_usual_errors(rig, data, options))
-                shares.append(_share(rig, data, left))
+    cases = [(x.share, *x.case) for x in tested if x.case]
+    for share, rig, data in cases:
+        peers = [other for other, of, _ in cases if (of is plant) == (rig is plant)]
+        if share < most and share <= options.diagnosis_tie * min(peers):
+            torque = data.tau - data.needed(rig)
+            left, _ = _balance(data, torque, *_usual_errors(rig, data, options))
+            shares.append(_share(rig, data, left))
     return min(shares)
 
 
@@ -890,7 +889,7 @@ def _delay_beside_usual_errors(
     # A torque that is held until the next sample acts up to one step late.
     held = -max(r.sample_time for r in recordings) <= delay <= 0
     if not held and options.diagnosis_ratio * share < sound:
-        yield Mistake(f"{delay_in_words(delay)}, beside usual errors of the rig", share)
+        yield Mistake(f"{delay_in_words(delay)}, together with usual errors of the rig", share)
 
 
 def _corrected_torques(
