@@ -22,7 +22,7 @@ from nfriction.fitting.data.inputs import (
     require_drive,
     warn_of_undriven,
 )
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning, unlike_training
+from nfriction.fitting.diagnosis.mistakes import likely_mistakes, mistake_warning, unlike_training
 from nfriction.fitting.options import DEFAULTS, checked_lengths
 from nfriction.fitting.result.fit_result import UNIFORM_TURN, FitResult
 from nfriction.friction import both_names, model_name

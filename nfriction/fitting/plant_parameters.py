@@ -54,13 +54,13 @@ def plant_parameters(
     for j in driven if "gear_loss" in buffers else ():
         unit = _at(buffers, "gear_loss", j)
         found.append(_amount(buffers, f"gear loss {j + 1}", unit, options.loss_term))
-    kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
     # The bias of a sensor; the drive of an inclined axis also holds its weight.
     shares = options.asymmetry_term if plant.unit == "m" else options.offset_term
     bound, sd = (share * largest_torque for share in shares)
     for j in driven:
         unit = _at(buffers, "torque_offset", j)
-        found.append(PlantParameter(f"{kind} offset {j + 1} [{force}]", unit, -bound, bound, sd))
+        name = f"{plant.effort} offset {j + 1} [{plant.effort_unit}]"
+        found.append(PlantParameter(name, unit, -bound, bound, sd))
     if driven and "asymmetry" in buffers and largest_rate > 0:
         bound, sd = (share * largest_torque / largest_rate for share in options.asymmetry_term)
         unit = {"asymmetry": torch.ones_like(buffers["asymmetry"])}

@@ -10,9 +10,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nfriction.fitting import diagnosis
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.data import inputs
+from nfriction.fitting.diagnosis.balance import Source, collect
+from nfriction.fitting.diagnosis.changes import changing_friction, loose_loads
+from nfriction.fitting.diagnosis.corrections import balanced_delay
+from nfriction.fitting.diagnosis.mistakes import correction_note, likely_mistakes, mistake_warning
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
@@ -114,11 +117,11 @@ def prepare_task(
         if not inputs.largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
         # A search by simulation finds the delay only from a start within a cycle of the motion.
-        delay, _ = diagnosis.balanced_delay(plant, joint, moved, options)
+        delay, _ = balanced_delay(plant, collect(Source(joint, moved, options)))
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
     diagnosed = partial(
-        diagnosis.likely_mistakes, recordings=advanced, motions=moved, convention=convention,
+        likely_mistakes, recordings=advanced, motions=moved, convention=convention,
         options=options, zeroed=per_recording, presliding=bool(model.law.memory),
     )  # fmt: skip
     stated, mistakes = diagnosed(plant)
@@ -126,11 +129,11 @@ def prepare_task(
     # Without torques only the ratios of its terms matter, and no drive can be the cause.
     free = options.fit_plant and not inputs.largest_torques(joint).any()
     if free and first is not None and first.rig is not None:
-        corrected, plant = (diagnosis.correction_note(stated, first),), first.rig
+        corrected, plant = (correction_note(stated, first),), first.rig
         doubted = (first.text,) if first.timed else ()
         start = start and start.with_terms_times({n: 1.0 / x for n, x in first.ratios.items()})
         stated, mistakes = diagnosed(plant)
-    named = diagnosis.mistake_warning(stated, mistakes) + corrected
+    named = mistake_warning(stated, mistakes) + corrected
     for sentence in named:
         # A fit to such data may take minutes, and would report this only at its end.
         logging.getLogger(__name__).warning(sentence)
@@ -139,9 +142,9 @@ def prepare_task(
     drift: list[str] = []
     # Errors of the data would look like changes.
     if not (mistakes or unmodelled):
-        for changed, sentence in diagnosis.changing_friction(*of):
+        for changed, sentence in changing_friction(*of):
             (drift if changed == "friction" else unmodelled).append(sentence)
-        unmodelled += diagnosis.loose_loads(*of)
+        unmodelled += loose_loads(*of)
     found = (
         *named,
         *drift,

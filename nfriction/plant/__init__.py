@@ -2,7 +2,6 @@
 
 from nfriction.plant import rigs
 from nfriction.plant.base import LinearAxis, Motor, Plant
-from nfriction.plant.chain import Arm, PendulumChain
-from nfriction.plant.rotor import Rotor
+from nfriction.plant.chain import Arm, PendulumChain, Rotor
 
 __all__ = ["Arm", "LinearAxis", "Motor", "PendulumChain", "Plant", "Rotor", "rigs"]

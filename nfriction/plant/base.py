@@ -130,6 +130,15 @@ class Plant(nn.Module, ABC):
         _ = self.motor_factors  # raises unless there is one number for each joint
 
     @property
+    def effort(self) -> str:
+        """Name of what moves a joint: a torque, or the force on an axis."""
+        return "force" if self.unit == "m" else "torque"
+
+    @property
+    def effort_unit(self) -> str:
+        return "N" if self.unit == "m" else "N m"
+
+    @property
     def motor_factors(self) -> dict[str, list[float]]:
         """Position of each joint per motor angle, and its torque per motor current, if known."""
         if self.motor is None:

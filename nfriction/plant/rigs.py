@@ -31,8 +31,7 @@ from torch import Tensor
 from nfriction.io.files import is_intact, parse_json, write_atomically
 from nfriction.plant import robot_file
 from nfriction.plant.base import LinearAxis, Plant
-from nfriction.plant.chain import Arm, PendulumChain
-from nfriction.plant.rotor import Rotor
+from nfriction.plant.chain import Arm, PendulumChain, Rotor
 
 _HANGING = ("relative", "hanging")
 _PAPER_QUANTUM = math.tau / 8192  # 2048 pulses per revolution, counted on all four edges

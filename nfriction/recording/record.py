@@ -9,6 +9,7 @@ import reprlib
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
@@ -98,7 +99,7 @@ class Recording:
         """Time from the first to the last sample [s]."""
         return float(self.time[-1] - self.time[0])
 
-    @property
+    @cached_property
     def sample_time(self) -> float:
         """Median step between samples [s]."""
         return float(np.median(np.diff(self.time)))

@@ -24,10 +24,11 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting import diagnosis
 from nfriction.fitting.adjusted_plant import adjusted_plant
 from nfriction.fitting.data import inputs
-from nfriction.fitting.diagnosis import changing_friction, loose_loads
+from nfriction.fitting.diagnosis import changes
+from nfriction.fitting.diagnosis.changes import changing_friction, loose_loads
+from nfriction.fitting.diagnosis.corrections import corrected_rigs
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.fit_result import DOUBTFUL_ERROR
@@ -365,8 +366,8 @@ def test_recording_with_different_friction_is_named(change, rate, named, monkeyp
         found, *others = estimated(*given)
         return rate or found, *others
 
-    estimated = diagnosis._growth
-    monkeypatch.setattr(diagnosis, "_growth", growth)
+    estimated = changes._growth
+    monkeypatch.setattr(changes, "_growth", growth)
     recordings, rng = [], np.random.default_rng(0)
     time = 0.004 * np.arange(2001)[:, None]
     for number, fastest in enumerate((1.3, 1.7, 2.3, 1.9)):
@@ -1472,6 +1473,4 @@ def test_an_unbalanced_rotor_is_named():
 
 
 def test_a_wrong_unit_is_listed_once():
-    assert [text for text, _ in diagnosis._corrected_rigs(LinearAxis(2.0), True)] == [
-        "masses are in g"
-    ]
+    assert [text for text, _ in corrected_rigs(LinearAxis(2.0), True)] == ["masses are in g"]

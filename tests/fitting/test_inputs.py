@@ -234,7 +234,7 @@ def test_an_accepted_network_has_the_interval_of_the_fall_by_heat(monkeypatch) -
 @pytest.mark.parametrize("inputs", [pytest.param(["heat"], marks=pytest.mark.slow), []])
 def test_friction_change_counts_against_a_network_only_without_heat(inputs, monkeypatch):
     falls = [("friction", "The friction of joint1 falls by 30 %.")]
-    monkeypatch.setattr("nfriction.fitting.diagnosis.changing_friction", lambda *_: falls)
+    monkeypatch.setattr("nfriction.fitting.task.changing_friction", lambda *_: falls)
     recording = swing(pendulum(), truth("heat"), seconds=3.0)
     law = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
     assert "falls by 30 %" in law.usability[1]
@@ -263,7 +263,7 @@ def test_inputs_that_leave_only_noise_answer_the_warnings_of_their_law(
     monkeypatch.setattr(neurofuzzy, "_with_chosen_inputs", choose)
     monkeypatch.setattr(neurofuzzy._Contest, "train", lambda self: None)
     monkeypatch.setattr(
-        "nfriction.fitting.diagnosis.changing_friction", lambda *_: [("friction", drift)]
+        "nfriction.fitting.task.changing_friction", lambda *_: [("friction", drift)]
     )
     recording = swing(pendulum(), truth(name), seconds=2.0)
     found = fit(NFCVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)

@@ -245,7 +245,7 @@ class FitResult:
         """Unit of `residual`: of positions (rad, m), or of torques (N m, N)."""
         if self.residuals.numel():
             return self.plant.unit
-        return "N" if self.plant.unit == "m" else "N m"
+        return self.plant.effort_unit
 
     def names_with_si(self) -> dict[str, str]:
         """Names of relative plant terms, each with the value in SI as given and as fitted."""

@@ -74,8 +74,7 @@ def result_from_equation_error(
         _one_way(rig, joint, True, float(total[joint]), largest)
         for joint in (total != plant.torque_offset).nonzero().flatten().tolist()
     )
-    kind = "force" if plant.unit == "m" else "torque"
-    changes = {f"{kind} offset {j + 1}": x for j, x in enumerate(torque.offset.tolist())}
+    changes = {f"{plant.effort} offset {j + 1}": x for j, x in enumerate(torque.offset.tolist())}
     return FitResult(
         model=model.requires_grad_(False),
         plant=rig.replace(torque_offset=total) if torque.offset.any() else rig,
@@ -326,9 +325,8 @@ def offset_warnings(
 
 def _one_way(plant: Plant, joint: int, constant: bool, value: float, largest: Tensor) -> str:
     """A sentence for a drive's torque in one direction, given the largest friction, (joint,)."""
-    slides = plant.unit == "m"
-    kind = ("constant " * constant) + "drive " + ("force" if slides else "torque")
-    unit = ("N" if slides else "N m") if constant else "N s/m times the speed"
+    kind = f"{'constant ' * constant}drive {plant.effort}"
+    unit = plant.effort_unit if constant else "N s/m times the speed"
     way = "backwards" if value > 0 else "forwards"
     cause = f"may equally be friction that is {2 * abs(value):.3g} {unit} larger {way}"
     if constant and abs(value) > largest[joint]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.diagnosis import delay_in_words
+from nfriction.fitting.diagnosis.corrections import delay_in_words
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter, loglik_tolerance

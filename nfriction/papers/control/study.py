@@ -34,9 +34,9 @@ from nfriction.papers.control.feedback import (
     balance_gains,
     gains_along,
     linearise,
+    plan_swing_up,
     still,
 )
-from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.papers.twin.dataset import COUNTS, SPECIFICATIONS
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plant.chain import Arm

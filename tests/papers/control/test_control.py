@@ -19,8 +19,8 @@ from nfriction.papers.control.feedback import (
     balance_gains,
     gains_along,
     linearise,
+    plan_swing_up,
 )
-from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.simulation.rollout import rollout
 
 PLANT = rigs.rtip("free")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nfriction import NCFM
-from nfriction.papers.reproduction import figures, fresh, tables
+from nfriction.papers.reproduction import figures, stages, tables
 from nfriction.papers.twin.dataset import Encoder, specification
 from nfriction.papers.twin.mechanics import Links, simulate
 from nfriction.plant import rigs
@@ -14,18 +14,18 @@ from tests.papers.reproduction.test_tables import entry, workspace
 
 
 def test_errors_are_those_of_free_runs_from_the_poses() -> None:
-    true = fresh.true_positions(0.05)
-    np.testing.assert_allclose(true[:, 0], np.deg2rad(fresh.POSES))
+    true = stages.true_positions(0.05)
+    np.testing.assert_allclose(true[:, 0], np.deg2rad(stages.POSES))
     plant, model = rigs.tlrip(), NCFM(3, [0.05]).requires_grad_(False)
-    ours = np.array(fresh.free_run_errors(plant, model, true), dtype=float)
+    ours = np.array(stages.free_run_errors(plant, model, true), dtype=float)
     assert ours.shape == (10, 3)
     assert np.all((ours > 0) & (ours < 0.01))
     # Without the first sample's offset, which all later ones would have, too.
-    off = np.array(fresh.free_run_errors(plant, model, true - [0.1, 0.0, 0.0]), dtype=float)
+    off = np.array(stages.free_run_errors(plant, model, true - [0.1, 0.0, 0.0]), dtype=float)
     assert np.all(off[:, 0] > ours[:, 0])
     lost = np.array(true)
     lost[2, -1] = np.nan
-    assert fresh.free_run_errors(plant, model, lost)[2] == [None] * 3
+    assert stages.free_run_errors(plant, model, lost)[2] == [None] * 3
 
 
 def test_single_outlier_does_not_decide_the_order(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_single_outlier_does_not_decide_the_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pose", fresh.POSES)
+@pytest.mark.parametrize("pose", stages.POSES)
 def test_fresh_releases_can_be_predicted(pose: tuple[float, float, float]) -> None:
     links, friction = Links.of(rigs.tlrip()), specification("tlrip").friction
     count = Encoder().quantum
