@@ -152,7 +152,7 @@ _interrupted = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Remember a Ctrl-C, because solvers catch it to return their best point.
+    """Remember a Ctrl-C or SIGTERM, because solvers catch it to return their best point.
 
     The run ends at its next progress report.
     """
@@ -165,11 +165,12 @@ def interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # signals reach the main thread only
         return
-    before = signal.signal(signal.SIGINT, interrupt)
+    before = {kind: signal.signal(kind, interrupt) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
 
 
 # Time between two lines of progress in a log [s].

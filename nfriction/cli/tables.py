@@ -1,5 +1,6 @@
 """Printed tables and verdicts of fits and comparisons."""
 
+import math
 from collections.abc import Sequence
 
 from nfriction.cli.console import one_line
@@ -7,6 +8,7 @@ from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 
@@ -80,11 +82,15 @@ def verdict(comparison: Comparison) -> str:
     error = 1e3 * comparison.table(over)["all"][best]
     run = f"windows of {over} s, as the free run is chaotic," if over else "free run"
     end = "; no model is better" if best == NO_FRICTION else ""
+    tied, limit = comparison.indistinguishable(), comparison.limit(over)
+    times = 1e-3 * error / (limit or math.inf)
+    above = ""
+    if times > DEFAULTS.model_error_ratio:
+        above = f", {times:.0f} times the limit of these data"
     found = (
         f"best on test recordings: {best} ({run} over all joints: {error:.3g} "
-        f"m{comparison.unit}){end}"
+        f"m{comparison.unit}{above}){end}"
     )
-    tied, limit = comparison.indistinguishable(), comparison.limit(over)
     # Without a limit no difference can be called insignificant.
     if len(tied) > 1 and limit is not None:
         rated = {n: f" ({comparison.rating(n)[0]})" for n in comparison.fits}

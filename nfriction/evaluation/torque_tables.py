@@ -127,8 +127,16 @@ class TorqueFits:
     def _models(self, model: str | None) -> list[SavedModel]:
         """The model of each joint, as `_names`."""
         pairs = zip(self.table.joint_names, self._names(model), strict=True)
-        return [SavedModel(joint, self.table.unit, self.fits[name][k].model)
-                for k, (joint, name) in enumerate(pairs)]  # fmt: skip
+        unit = self.table.unit
+        return [SavedModel(j, unit, self.fits[name][k].model, self._left_out(name)[j] or math.nan)
+                for k, (j, name) in enumerate(pairs)]  # fmt: skip
+
+    def _left_out(self, name: str) -> dict[str, float | None]:
+        """Root mean square error of a model on hold-out blocks, by joint."""
+        return {
+            joint: _finite(next(c.error for c in of if c.name == self._known(name)))
+            for joint, of in self.candidates.items()
+        }
 
     def info(self, name: str) -> ModelInfo:
         """Entries of the model file of a model of all joints."""
@@ -154,6 +162,7 @@ class TorqueFits:
                     for one in found
                     for i in one.intervals
                 },
+                "blocks_left_out": self._left_out(name),
             },
         )
 
@@ -174,7 +183,7 @@ class TorqueFits:
         return [_predicted(one.model, joint) for one, joint in pairs]
 
     def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
-        """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
+        """Errors by joint: model, rmse [N m; N], nrmse [-], and rmse on blocks left out."""
         return score_models(self._models(model), as_table(table, unit=self.table.unit))
 
     def to_frame(self) -> pd.DataFrame:
@@ -580,10 +589,12 @@ def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
             f"not distinguishable from the least, of {plain_name(least.name)}, with {number} "
             "parameters"
         )
-    others = sorted(c.error for c in candidates if c is not least)
+    others = [c for c in candidates if c is not least]
     if not others:
         return least, "the only model"
-    return least, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
+    second = min(others, key=lambda c: c.error)
+    more = 100 * (second.error / least.error - 1)
+    return least, f"{plain_name(second.name)} has {more:.0f} % more"
 
 
 def _fit(
@@ -667,11 +678,12 @@ def _predicted(model: FrictionModel, joint: JointTorque) -> Array:
 
 
 class SavedModel(NamedTuple):
-    """A model of one joint, from a fit or from a file."""
+    """A model of one joint, from a fit or from a file, with its error on hold-out blocks."""
 
     joint: str
     unit: Unit
     model: FrictionModel
+    left_out: float = math.nan  # root mean square [N m; N]; NaN if it is unknown
 
 
 def read_models(path: str | Path) -> list[SavedModel]:
@@ -707,7 +719,9 @@ def _saved(path: Path) -> list[SavedModel]:
     model, info = load(path), load_info(path)
     names = info.joint_names or [f"joint{k + 1}" for k in range(model.joints)]
     unit: Unit = "m" if info.unit == "m" else "rad"
-    return [SavedModel(name, unit, one) for name, one in zip(names, split(model), strict=True)]
+    errors = info.fit.get("blocks_left_out", {})
+    return [SavedModel(name, unit, one, float(errors.get(name) or math.nan))
+            for name, one in zip(names, split(model), strict=True)]  # fmt: skip
 
 
 def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFrame:
@@ -718,7 +732,14 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     """
     _check_joints([one.joint for one in models], table)
     pairs = zip(models, table.joints, strict=True)
-    return pd.DataFrame([score_joint(joint, one.model) for one, joint in pairs]).set_index("joint")
+    found = pd.DataFrame([score_joint(joint, one.model) for one, joint in pairs]).set_index("joint")
+    times = {m.joint: e / m.left_out for m, e in zip(models, found["rmse"], strict=True)}
+    if far := [f"{j} ({x:.2g})" for j, x in times.items() if x > DEFAULTS.diagnosis_ratio]:
+        logger.warning(
+            "errors are many times those on blocks left out of the training table at %s; this "
+            "table differs from it, as in temperature, load, wear or speeds.", ", ".join(far),
+        )  # fmt: skip
+    return found.assign(left_out=[one.left_out for one in models])
 
 
 def split(model: FrictionModel) -> list[FrictionModel]:

@@ -66,6 +66,7 @@ def source_of(
         and any(_depends(x, "load") for x in _traced_law(controller.model, 1).outputs[0].nodes),
         "bits": description["status_bits"],
         "drive_torques": [] if plant is None else plant.torque_offset.tolist(),
+        "gear_losses": getattr(plant, "gear_loss", torch.zeros(0)).tolist(),
         # Names and units are untrusted text.
         "about": description,
         "safe": lambda text: comment(str(text)).rstrip(),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.data import inputs
-from nfriction.fitting.diagnosis.balance import Source, collect
+from nfriction.fitting.diagnosis.balance import Source, collect, unexplained_share
 from nfriction.fitting.diagnosis.changes import changing_friction, loose_loads
 from nfriction.fitting.diagnosis.corrections import balanced_delay
 from nfriction.fitting.diagnosis.mistakes import correction_note, likely_mistakes, mistake_warning
@@ -117,7 +117,11 @@ def prepare_task(
         if not inputs.largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
         # A search by simulation finds the delay only from a start within a cycle of the motion.
-        delay, _ = balanced_delay(plant, collect(Source(joint, moved, options)))
+        given_times = collect(Source(joint, moved, options))
+        delay, share = balanced_delay(plant, given_times)
+        # Vibrations, or a wrong law, have valleys at other delays that are hardly lower.
+        if options.diagnosis_tie * share > unexplained_share(plant, given_times):
+            delay = 0.0
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
     diagnosed = partial(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nfriction.io import formats
 from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, slides, to_si
 from nfriction.recording.record import Unit
-from nfriction.recording.validation import Array, gaps, time_unit, turns_between_samples
+from nfriction.recording.validation import Array, gaps, restarts, time_unit, turns_between_samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -388,9 +388,12 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         raise ValueError(f"{name} has {len(tau)} rows; at least {MINIMUM_ROWS} are needed.")
     if time is not None and not np.all(np.diff(time) > 0):
         k = int(np.flatnonzero(np.diff(time) <= 0)[0])
+        remedy = "sort the rows, or drop the column time if they are unordered"
+        if restarts(time):
+            remedy = "the clock starts again there, so count on, or drop the column time"
         raise ValueError(
             f"time of {name} must increase from row to row, got {time[k]:g} s and then "
-            f"{time[k + 1]:g} s; sort the rows, or drop the column time if they are unordered."
+            f"{time[k + 1]:g} s; {remedy}."
         )
     if qd is None:
         assert time is not None

@@ -108,6 +108,16 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
         )
 
 
+def restarts(time: Array) -> bool:
+    """True if stamps fall by many rows, and seldom: the clock starts again; else rows are unsorted.
+
+    Sorted, the rows of both parts would lie between each other.
+    """
+    back = np.flatnonzero(np.diff(time) < 0)
+    earlier = time[np.maximum(0, back - MINIMUM_SAMPLES)]
+    return 0 < len(back) * MINIMUM_SAMPLES < len(time) and bool((time[back + 1] <= earlier).all())
+
+
 def _check_stamps(time: Array) -> None:
     steps = np.diff(time)
     if (steps > 0).all():
@@ -116,10 +126,12 @@ def _check_stamps(time: Array) -> None:
     k = int(np.argmax(steps < 0) if (steps < 0).any() else np.argmax(steps <= 0))
     before, after = float(time[k]), float(time[k + 1])
     if before > after:
-        remedy = "sort the rows and drop repeated stamps, or unwrap a counter (`numpy.unwrap`)"
-        usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
-        if (np.abs(time[1:][steps < 0] - time[0]) <= 2 * usual).all():
-            remedy = "it starts again there, so read each recording in the file separately"
+        remedy = "sort the rows and drop repeated stamps"
+        if restarts(time):
+            remedy = (
+                "the clock starts again there, so read each part of the file as a recording of its "
+                "own; if a counter overflows, unwrap it (`numpy.unwrap`)"
+            )
     elif abs(after) >= LARGE_STAMP:
         # The stamps of a clock have more digits than the logger wrote.
         remedy = "write large stamps with more digits, or count from the recording's start"

@@ -196,25 +196,29 @@ def test_file_name_that_is_not_unicode_loses_no_fits(bench: Path, tmp_path: Path
         assert "surr" in file.read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_ends_the_run_although_the_solver_catches_it(
-    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    bench: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    kind: signal.Signals,
 ) -> None:
     stages = []
     step = Progress.step
 
     def interrupted_step(self: Progress, stage: str) -> None:
         stages.append(stage)
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(kind)
         step(self, stage)
 
     monkeypatch.setattr(Progress, "step", interrupted_step)
     out = bench / "interrupted"
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(kind)
     assert compare(bench, out, models="NCFM,LFM") == 130
     assert len(stages) == 1  # the second model was never started
     assert "interrupted (fit NCFM)" in capsys.readouterr().err
     assert not list(out.iterdir())
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(kind) is before
 
 
 def test_linear_algebra_failure_is_a_one_line_error(

@@ -22,7 +22,10 @@ def csv(tmp_path: Path) -> Path:
 
 
 def test_a_table_is_fitted_scored_and_exported(
-    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    csv: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     out = tmp_path / "run"
     words = ["--columns", "qd=speed", "--models", "viscous,coulomb-viscous"]
@@ -38,6 +41,12 @@ def test_a_table_is_fitted_scored_and_exported(
         row = capsys.readouterr().out.splitlines()[-1].split()
         assert row[:2] == ["joint1", "coulomb-viscous"]
         assert float(row[3]) < 0.05
+        assert float(row[2]) < 2 * float(row[4])
+    warm = tmp_path / "warm.csv"
+    rows = [line.split(",") for line in csv.read_text().splitlines()]
+    warm.write_text("\n".join([",".join(rows[0]), *(f"{a},{0.7 * float(b)}" for a, b in rows[1:])]))
+    assert main(["score-torque", str(out), str(warm), "--columns", "qd=speed"]) == 0
+    assert "times those on blocks left out of the training table at joint1 (" in caplog.text
     file = str(out / "models" / "CVFM.json")
     assert main(["info", file]) == 0
     assert "coulomb-viscous" in capsys.readouterr().out

@@ -418,6 +418,9 @@ def test_a_doubtful_model_is_not_the_best_if_a_good_one_is_no_worse(comparison):
     assert near.best() == "NCFM"
     assert near.indistinguishable() == ("NCFM", "LFM")
     assert "best on test recordings: NCFM" in verdict(near)
+    assert "times the limit" not in verdict(near)
+    far = verdict(scored(doubtful, 0.1, no_friction=5.0, NCFM=2.0, LFM=1.0))
+    assert "best on test recordings: LFM (free run over all joints: 1e+03 mrad, 6 times the" in far
     assert "statistically tied with LFM (doubtful) (" in verdict(near)
     assert scored(doubtful, 0.6, no_friction=5.0, NCFM=2.0, LFM=1.0).best() == "LFM"
 

@@ -619,10 +619,13 @@ def test_comments_name_continuous_and_linear_positions(tmp_path):
     assert not any(word in text for text in texts["m"] for word in ("angle", "upright"))
 
 
-def test_header_contains_the_fitted_torque_offsets_of_the_drives(tmp_path):
+def test_header_contains_the_fitted_offsets_and_losses_of_the_drives(tmp_path):
     plant = rigs.multiarm_double()
-    offset = torch.tensor([0.0, -0.015], dtype=torch.float64)
-    for name, rig in (("with", plant.replace(torque_offset=offset)), ("without", plant)):
+    offset, loss = torch.tensor([[0.0, -0.015], [0.05, 0.0]], dtype=torch.float64)
+    fitted = plant.replace(torque_offset=offset, gear_loss=loss)
+    for name, rig in (("with", fitted), ("without", plant)):
         c(random_model("CVFM", 2), tmp_path, ModelInfo(rig=rig.to_dict()), name=name)
-    assert " *     0 -0.015 [N m]\n" in (tmp_path / "with.h").read_text()
+    header = (tmp_path / "with.h").read_text()
+    assert " *     0 -0.015 [N m]\n" in header
+    assert "the gears lose in the fitted plant, which oppose qd:\n *     0.05 0 [-]\n" in header
     assert "Not in tau" not in (tmp_path / "without.h").read_text()

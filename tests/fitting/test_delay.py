@@ -1,18 +1,20 @@
 """The delay of the torque is estimated together with the friction, with its interval."""
 
+import math
 import re
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LinearAxis, Recording, compare, fit, rollout, score_fit
+from nfriction import CVFM, NCFM, LinearAxis, Recording, Stribeck, compare, fit, rollout, score_fit
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.task import prepare_task
 from nfriction.papers.afem.adaptive import ACVFM
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import COUNTS, F64, driven_axis, pendulum, swing
@@ -69,6 +71,35 @@ def test_fitted_delay_is_recovered_within_its_interval():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("late", [0.0, 0.004, 0.0125])
+def test_vibrations_do_not_shift_the_delay_by_their_period(late):
+    """A controlled joint vibrates, so that the torques fit nearly as well a period later."""
+    time = 1e-4 * np.arange(40_001)
+    slow = 8.0 * np.sin([[2.0], [3.1], [4.7]] * time + [[0.3], [2.0], [4.0]]).sum(0)
+    tau = (slow + 40.0 * np.sin(math.tau * 60.0 * time))[:, None]
+    axis, dip = LinearAxis(2.0), Stribeck(1, [3.0, 3.0, 3.0, 0.15, 2.0], v_smooth=5e-3)
+    rest = torch.zeros(1, dtype=F64)
+    out = rollout(
+        axis, dip, rest, rest, torch.as_tensor(tau[:-1]), sample_time=1e-4, gradients=False
+    )
+    recording = Recording(time, quantise(out.q.numpy(), 1e-6), tau=tau, unit="m")[::10]
+    recording = recording._replace(tau=recording.torque_at(recording.time - late))
+    task = prepare_task("coulomb-viscous", axis, recording, FitOptions(fit_delay=True))
+    assert task.delay == pytest.approx(late, abs=5e-4)
+
+
+def test_early_torques_are_doubtful_beside_a_residual():
+    """A wrong law may cause them, while filtered positions leave only noise."""
+    recording, settings = delayed(), {"windows": (0.5,), "fit_plant": False, "fit_delay": True}
+    early = recording._replace(tau=recording.torque_at(recording.time + 2 * LATE))
+    sound = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), early, **settings)
+    assert sound.torque_delay == pytest.approx(-LATE, abs=1e-3)
+    assert not any("later than torques" in text for text in sound.warnings)
+    wrong = fit(NCFM(1), LinearAxis(2.0), early, **settings)
+    assert any("Positions seem to be recorded" in text for text in wrong.unmodelled)
+    assert wrong.usability[0] != "good"
+
+
 def test_scores_use_the_fitted_delay():
     train, test = delayed("one"), delayed("two", 2.0)
     test = test._replace(q=-test.q, tau=-test.tau)  # the other way, or a fit would have seen it

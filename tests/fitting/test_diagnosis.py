@@ -1117,6 +1117,29 @@ def test_lost_counts_and_missing_samples_are_named_with_their_time():
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
+@pytest.mark.parametrize("jitter", [0.0, 5e-5, 1e-4])
+def test_rows_left_out_with_their_times_are_no_jumps(jitter):
+    random, time = np.random.default_rng(0), 1e-3 * np.arange(15_000)
+    kept = random.random(len(time)) > 3e-3
+    q = quantise(np.sin(time)[:, None] + 0.3 * np.sin(7 * time)[:, None], 1e5)[kept]
+    stamps = time[kept] + jitter * random.normal(size=kept.sum())
+    assert not [*inputs.lasting_jumps([Recording(stamps, q)], FitOptions())]
+    lost = q + 0.02 * (np.arange(len(q)) > 7000)[:, None]
+    assert len([*inputs.lasting_jumps([Recording(stamps, lost)], FitOptions())]) == 1
+
+
+@pytest.mark.parametrize("wrong", ["q1", "motor1"])
+def test_positions_of_joints_read_as_of_motors_are_named(wrong):
+    _, q, tau = measured("direct")
+    # Of a motor without inertia.
+    plant = PendulumChain(**MOTOR | {"armature": None, "inertia": [0.0575]}, motor=Motor(20.0))
+    first = warnings_of(plant, q * 20.0 if wrong == "q1" else q / 20.0, tau)[0]
+    other = "joints, but were read as those of their motors (`q1`, ...)"
+    if wrong == "q1":
+        other = "motors, but were read as those of the joints (`motor1`, ...)"
+    assert f"positions are of the {other}" in first
+
+
 def test_counter_overflow_is_named():
     plant, q, tau = measured("driven")
     wrapped = (q + 0.1) % 0.7
@@ -1214,9 +1237,12 @@ def test_fit_states_whether_it_is_usable():
     lost = replace(wrong, residual=3.0).usability
     assert lost == ("do not use", "the residual is larger than the motion")
     sd = math.sqrt(np.concatenate([m.q for m in wrong.motions]).var())
-    verdicts = [replace(wrong, residual=share * sd).usability[0] for share in (0.65, 0.75)]
+    whole = replace(wrong, stages=())
+    verdicts = [replace(whole, residual=share * sd).usability[0] for share in (0.65, 0.75)]
     # Half of the variance is 0.71 standard deviations.
     assert verdicts == ["doubtful", "do not use"]
+    # Short windows contain less motion.
+    assert replace(wrong, residual=0.65 * sd).usability[0] == "do not use"
     assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
 
 

@@ -87,6 +87,8 @@ def test_columns_are_mapped_with_their_units(tmp_path: Path) -> None:
 def test_titles_above_the_header_are_skipped(tmp_path: Path, separator: str) -> None:
     title = f"Bench 7{2 * separator}\n\nsecond run\n"
     assert np.array_equal(read(tmp_path, title + written(separator, False)).q, Q)
+    settings = f"Rate [Hz]{separator}1000\nStarted{separator}29.11.2026\n\n"
+    assert np.array_equal(read(tmp_path, settings + written(separator, False)).q, Q)
     # A single word is no header of a table, and neither are numbers.
     with pytest.raises(ValueError, match=r"header|missing"):
         read(tmp_path, written(separator, False, header="time"))

@@ -375,7 +375,7 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
         ({"time": -np.arange(60.0)}, "`time` must increase"),
         ({"time": np.r_[0.0:30, 28:58]}, r"got 29\.0 then 28\.0 s at sample 30 .*sort the rows"),
         ({"time": 1.7e9 + np.r_[0.0:30, 28:58]}, "sort the rows"),
-        ({"time": np.r_[0.0:30, 0:30]}, r"got 29\.0 then 0\.0 s .*read each recording in the file"),
+        ({"time": np.r_[0.0:30, 0:30]}, r"got 29\.0 then 0\.0 s .*read each part of the file as"),
         (
             {"time": 1.7e9 + np.repeat(np.arange(30.0), 2)},
             r"got 1700000000\.0 then 1700000000\.0 s .*with more digits, or count from",

@@ -13,6 +13,10 @@
  * Not in tau: constant torques of the drives in the fitted plant, to be subtracted from a command:
  *    {% for x in drive_torques %} {{ "%.3g" % x }}{% endfor %} [{{ safe(about.units.tau_f) }}]
 {% endif %}
+{% if gear_losses | select | list %}
+ * Not in tau: shares of the transmitted torque that the gears lose in the fitted plant, which oppose qd:
+ *    {% for x in gear_losses %} {{ "%.3g" % x }}{% endfor %} [-]
+{% endif %}
  * Sample time: {{ "any" if about.sample_time is none else "%.9g s" % about.sample_time }}.
  * Joints, in order:
 {% for name in about.joint_names or range(1, joints + 1) %}

@@ -580,14 +580,16 @@ def lasting_jumps(recordings: Sequence[Recording], options: FitOptions) -> Itera
         steps, periods = np.diff(recording.q, axis=0), np.diff(time)[:, None]
         steps[gaps(time)] = np.nan
         even = steps * recording.sample_time / periods
-        # Also if scaled to equal length: either the samples or their time stamps may jitter.
-        for step in (steps, even):
+        # Also if scaled to equal length, by the stamps or by the number of rows in between: samples
+        # or their stamps may jitter, and rows with a missing cell are left out.
+        rows = np.fmax(1, np.rint(periods / recording.sample_time))
+        for step in (steps, even, steps / rows):
             before, at, after = step[:-2], step[1:-1], step[2:]
             high = np.minimum(np.abs(at - before), np.abs(at - after))
             heights.append(np.where(2 * np.abs(after - before) <= high, high, 0.0))
         # The step after a late sample is long, and both together are as usual.
         both = (steps[:-2] + steps[1:-1]) * recording.sample_time / (periods[:-2] + periods[1:-1])
-        height = np.where(2 * np.abs(both - even[2:]) > least, np.minimum(*heights), 0.0)
+        height = np.where(2 * np.abs(both - even[2:]) > least, np.minimum.reduce(heights), 0.0)
         for name, jump, high in zip(recording.names, (height > least).T, height.T, strict=True):
             if not jump.any():
                 continue

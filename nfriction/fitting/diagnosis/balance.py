@@ -258,11 +258,18 @@ def least_unexplained(
 
     # The valley is as wide as a swing, so that a coarse grid finds it.
     grid = np.linspace(lowest, highest, count)
-    best = int(np.argmin([unexplained(x) for x in grid]))
-    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, count - 1)])
-    close = 5e-4 * (highest - lowest)
-    found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": close})
-    return float(found.x), float(found.fun)
+    square = np.square([unexplained(x) for x in grid])
+    beside = np.pad(square, 1, constant_values=math.inf)
+    valleys = (square < beside[:-2]) & (square <= beside[2:]) & (square <= 16 * square.min())
+    # Vibrations make several valleys, of which a grid shows the depth only about.
+    close, found = 5e-4 * (highest - lowest), []
+    for k in sorted({int(np.argmin(square)), *np.flatnonzero(valleys).tolist()}):
+        around = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, count - 1)])
+        found.append(
+            minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": close})
+        )
+    best = min(found, key=lambda x: float(x.fun))
+    return float(best.x), float(best.fun)
 
 
 def drawn_terms(plant: Plant, data: Samples) -> list[PlantParameter]:

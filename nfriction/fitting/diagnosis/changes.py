@@ -148,7 +148,8 @@ def loose_loads(
             found.append(-float(least.solution[-1] / scale[-1]))
         share, sd = found[0], jackknife_sd(found[1:])
         sure, within = (student_quantile(pieces - 1, 1 - x) for x in (options.drift_chance, 0.025))
-        if share > max(sd * sure, 0.5 + sd * within):
+        # A wrong rig may seem to miss many times the load.
+        if max(sd * sure, 0.5 + sd * within) < share <= 1 + sd * within:
             yield (
                 f"The gear of {plant.joint_names[j]} has play: for about "
                 f"{options.diagnosis_block:g} s after the load reverses, {100 * share:.0f} ± "

@@ -178,14 +178,18 @@ class FitResult:
     def usability(self) -> tuple[Usability, str]:
         """Fitness for simulation and control, and the reason in a clause.
 
-        The residual is judged relative to the range of motion, because a fine encoder shows errors
-        that hardly matter; noise is not an error of the model.
+        The residual is judged relative to the motion within windows, because a fine encoder shows
+        errors that hardly matter; noise is not an error of the model.
         """
         noise = math.inf if self.noise is None else self.noise
-        falls, moves = weighs(self.plant), [m.q for m in self.motions]
-        if not falls:
-            # Uniform motion needs no torque, so a model that follows it explains nothing.
-            moves = [m.q - np.vander(m.time, 2) @ np.polyfit(m.time, m.q, 1) for m in self.motions]
+        falls, length = weighs(self.plant), self.stages[-1][0] if self.stages else math.inf
+        # Uniform motion needs no torque, so a model that follows it explains nothing.
+        degree, moves = 0 if falls else 1, []
+        for m in self.motions:
+            pieces = max(1, round(float(m.time[-1] - m.time[0]) / length))
+            for time, q in zip(*(np.array_split(x, pieces) for x in (m.time, m.q)), strict=True):
+                trend = np.vander(time - time.mean(), degree + 1)
+                moves.append(q - trend @ np.linalg.lstsq(trend, q, rcond=None)[0])
         moved = np.concatenate([q.var(axis=0) for q in moves] or [[math.inf]])
         # A joint that keeps turning over under gravity can be anywhere on its circle.
         most = UNIFORM_TURN**2 if falls else math.inf

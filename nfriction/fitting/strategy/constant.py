@@ -4,7 +4,7 @@ A nonlinear law is fitted from several starts: its own, and two from its nested 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TypeGuard
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import TORQUE_DELAY
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.equation_error import TorqueFit
 from nfriction.fitting.result.fit_result import FitResult
@@ -120,7 +121,21 @@ def fit_constant(task: FitTask) -> FitResult:
         delayed = _fitter(with_delay, model, torque, eccentric or rich)
         late, biased = delay_warning(found, delayed, fitted.intervals)
         fitted = fitted.with_warnings(late, unmodelled=late if biased else ())
-    return fitted.with_warnings(said, unmodelled=said if wrong else ())
+    early = [*_early_torque(task, fitted)]
+    return fitted.with_warnings(said + early, unmodelled=(said if wrong else []) + early)
+
+
+def _early_torque(task: FitTask, fitted: FitResult) -> Iterator[str]:
+    """A warning if a wrong law may cause the fitted delay, since no torque acts before its time."""
+    # A torque that is held until the next sample acts up to one step late.
+    late = -max(recording.sample_time for recording in task.recordings)
+    for i in fitted.intervals:
+        if i.name == TORQUE_DELAY and i.high < late and not task.leaves_noise(fitted):
+            yield (
+                f"Positions seem to be recorded {-1e3 * i.value:.2g} ms later than torques: they "
+                "may be filtered, but a wrong law or rig has the same effect, and the residual is "
+                "above the noise."
+            )
 
 
 def _begin(task: FitTask, fitter: ShootingFitter, torque: TorqueFit) -> Tensor:

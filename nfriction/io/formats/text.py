@@ -133,14 +133,17 @@ def _is_comment(line: str) -> bool:
 
 
 def _without_title(lines: list[str]) -> list[str]:
-    """The lines from the header on; titles before it fill one cell of their row."""
+    """The lines from the header on, which fills more cells than titles before it."""
     row = lines[min(len(lines), MOST_TITLES) - 1]
     separator = next((s for s in _SEPARATORS if s in row), None)
     cells = [[c for c in line.split(separator) if c.strip()] for line in lines[:MOST_TITLES]]
-    header = next((k for k, filled in enumerate(cells) if len(filled) > 1), 0)
-    # A header of one word is followed by numbers.
-    numbers = any(is_number(cell.replace(",", ".")) for cell in cells[header])
-    return lines if numbers else lines[header:]
+    # Settings of a logger, such as a date beside its name, fill fewer cells than the header.
+    for least in (max(map(len, cells)), 2):
+        header = next((k for k, filled in enumerate(cells) if len(filled) >= least), 0)
+        # A header of one word is followed by numbers.
+        if not any(is_number(cell.replace(",", ".")) for cell in cells[header]):
+            return lines[header:]
+    return lines
 
 
 def _separator(header: str, rows: list[str]) -> str:
