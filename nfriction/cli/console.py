@@ -170,7 +170,7 @@ def interruptible() -> Iterator[None]:
         yield
     finally:
         for kind, handler in before.items():
-            signal.signal(kind, handler)
+            signal.signal(kind, handler or signal.SIG_DFL)
 
 
 # Time between two lines of progress in a log [s].
@@ -227,9 +227,9 @@ class Progress:
         self._show(f"{self._what}, {stage}, step {self._steps}")
 
     def resume(self) -> None:
-        """Go on after a Ctrl-C, with the fits that were finished by then."""
+        """Go on after an interrupt, with the fits that were finished by then."""
         _interrupted.clear()
-        warn("interrupted: the finished fits are scored; another Ctrl-C ends the run.")
+        warn("interrupted: the finished fits are scored; another interrupt ends the run.")
 
     def _show(self, what: str) -> None:
         now = time.monotonic()

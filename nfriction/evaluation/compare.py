@@ -411,8 +411,8 @@ def compare(
         ImportError: if `jobs` needs joblib and it is not installed.
         ValueError, ArithmeticError, RuntimeError: if no model could be fitted; if only some could
             not, `failed` has the reasons.
-        KeyboardInterrupt: on a Ctrl-C before the first fit is finished; later, the models finished
-            by then are scored, and `failed` has the others.
+        KeyboardInterrupt: if interrupted before the first fit is finished; later, the models
+            finished by then are scored, and `failed` has the others.
     """
     models = [models] if isinstance(models, str) else models
     horizons = checked_lengths("horizons", horizons, 0)

@@ -734,10 +734,11 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     pairs = zip(models, table.joints, strict=True)
     found = pd.DataFrame([score_joint(joint, one.model) for one, joint in pairs]).set_index("joint")
     times = {m.joint: e / m.left_out for m, e in zip(models, found["rmse"], strict=True)}
-    if far := [f"{j} ({x:.2g})" for j, x in times.items() if x > DEFAULTS.diagnosis_ratio]:
+    if far := [f"{j}: {x:.2g}" for j, x in times.items() if x > DEFAULTS.diagnosis_ratio]:
         logger.warning(
-            "errors are many times those on blocks left out of the training table at %s; this "
-            "table differs from it, as in temperature, load, wear or speeds.", ", ".join(far),
+            "errors are more than twice those on blocks left out of the training table (times, at "
+            "%s); this table may differ from it in temperature, load, wear or speeds.",
+            ", ".join(far),
         )  # fmt: skip
     return found.assign(left_out=[one.left_out for one in models])
 

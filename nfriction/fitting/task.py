@@ -120,7 +120,7 @@ def prepare_task(
         given_times = collect(Source(joint, moved, options))
         delay, share = balanced_delay(plant, given_times)
         # Vibrations, or a wrong law, have valleys at other delays that are hardly lower.
-        if options.diagnosis_tie * share > unexplained_share(plant, given_times):
+        if not options.diagnosis_tie * share < unexplained_share(plant, given_times):
             delay = 0.0
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.

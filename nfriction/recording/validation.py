@@ -97,7 +97,7 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
             rule = f"within {LARGEST_VALUE:g}" if np.isfinite(value) else "finite"
             raise ValueError(
                 f"`{label}` must be {rule}, got {value} at sample {sample} ({len(bad)} in all); "
-                "drop such rows with their times, since samples may be missing."
+                "remove these rows with their times; a recording may lack samples."
             )
     _check_stamps(time)
     # No encoder has steps of a radian.
@@ -114,8 +114,9 @@ def restarts(time: Array) -> bool:
     Sorted, the rows of both parts would lie between each other.
     """
     back = np.flatnonzero(np.diff(time) < 0)
-    earlier = time[np.maximum(0, back - MINIMUM_SAMPLES)]
-    return 0 < len(back) * MINIMUM_SAMPLES < len(time) and bool((time[back + 1] <= earlier).all())
+    if not 0 < len(back) * MINIMUM_SAMPLES < len(time) or back[0] < MINIMUM_SAMPLES:
+        return False
+    return bool((time[back + 1] <= time[back - MINIMUM_SAMPLES]).all())
 
 
 def _check_stamps(time: Array) -> None:

@@ -46,7 +46,7 @@ def test_a_table_is_fitted_scored_and_exported(
     rows = [line.split(",") for line in csv.read_text().splitlines()]
     warm.write_text("\n".join([",".join(rows[0]), *(f"{a},{0.7 * float(b)}" for a, b in rows[1:])]))
     assert main(["score-torque", str(out), str(warm), "--columns", "qd=speed"]) == 0
-    assert "times those on blocks left out of the training table at joint1 (" in caplog.text
+    assert "twice those on blocks left out of the training table (times, at joint1: " in caplog.text
     file = str(out / "models" / "CVFM.json")
     assert main(["info", file]) == 0
     assert "coulomb-viscous" in capsys.readouterr().out

@@ -65,7 +65,7 @@ def test_known_coefficients_are_recovered_within_their_intervals() -> None:
     assert errors["Stribeck"] < errors["CVFM"] < errors["NCFM"]
 
 
-@pytest.mark.parametrize("scale", [1e-2, 1e-4])
+@pytest.mark.parametrize("scale", [pytest.param(1e-2, marks=pytest.mark.slow), 1e-4])
 def test_slow_axis_has_the_friction_of_a_fast_joint(scale: float) -> None:
     """Start values and bounds in rad/s would give an axis in m neither a peak nor a bend."""
     time, qd = motion(800, 0)
@@ -234,7 +234,7 @@ def test_folder_of_another_kind_is_refused(tmp_path: Path) -> None:
         read_models(tmp_path)
 
 
-@pytest.mark.parametrize("sd", [0.0, 0.02])
+@pytest.mark.parametrize("sd", [pytest.param(0.0, marks=pytest.mark.slow), 0.02])
 def test_outliers_and_misfit_of_all_laws_are_reported(sd: float) -> None:
     rng = np.random.default_rng(3)
     qd = rng.uniform(-10, 10, 200)
@@ -313,7 +313,7 @@ def test_duplicated_rows_do_not_narrow_the_intervals() -> None:
     pd.testing.assert_frame_equal(five.intervals(), fit_torque(once, "stribeck").intervals())
 
 
-@pytest.mark.parametrize("rows", [1, 20])
+@pytest.mark.parametrize("rows", [1, pytest.param(20, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("timed", [True, False])
 def test_offset_and_direction_dependent_friction_are_reported(rows: int, timed: bool) -> None:
     table = speeds(rows)

@@ -104,7 +104,7 @@ names = pytest.mark.parametrize("name", model_names())
 few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
 
 
-@cases
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @names
 def test_is_strict_c89_and_passes_its_own_test(exported, name, dtype):
     _, _, folder = exported(name, dtype)
@@ -220,7 +220,7 @@ def test_status_reports_clamping_and_saturation(exported):
 
 
 @cases
-@pytest.mark.parametrize("name", ["LFM", "ALFM"])
+@pytest.mark.parametrize("name", [pytest.param("LFM", marks=pytest.mark.slow), "ALFM"])
 def test_the_filter_runs_inside(exported, name, dtype):
     _, controller, folder = exported(name, dtype, with_filter=True)
     build([*C89, "-c", "nfriction.c", "-o", "n.o"], folder)

@@ -41,7 +41,11 @@ MODELS: dict[str, FrictionModel] = {
     "load-slip": LoadSlip(2, HYSTERESIS),
     "neuro-fuzzy lugre": corrected(NFLuGre(2, [1.0, 0.5, 0.05, 1e3, 3.0, 0.4], terms=(3, 2))),
 }
-every_model = pytest.mark.parametrize("name", MODELS)
+# The others are special cases of these, or have the same elements.
+QUICK = {"elasto-plastic", "gear", "maxwell-slip", "neuro-fuzzy lugre"}
+every_model = pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in QUICK)) for x in MODELS]
+)
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
 

@@ -46,7 +46,7 @@ def test_one_joint_with_a_torque_limit_passes(write: Any, name: str, tmp_path: P
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
-@pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
+@pytest.mark.parametrize("name", [pytest.param("LFM", marks=pytest.mark.slow), "NFLFM", "ALFM"])
 @pytest.mark.parametrize("with_filter", [False, True])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_c_passes(name: str, with_filter: bool, dtype: str, tmp_path: Path) -> None:
@@ -71,7 +71,11 @@ ONE, ALL = {"f_a"}, {"f_c", "f_v", "f_a", "f_b"}
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        *(("c", ONE), ("c float", ONE), ("pt", ONE), ("c", ALL), ("c float", ALL), ("pt", ALL)),
+        *(("c", ONE), ("c float", ALL), ("pt", ALL)),
+        *(
+            pytest.param(*x, marks=pytest.mark.slow)
+            for x in (("c float", ONE), ("pt", ONE), ("c", ALL))
+        ),
         # The same arithmetic as a `.pt`, in formats that are slow to write.
         *(pytest.param(kind, ALL, marks=pytest.mark.slow) for kind in ("onnx", "onnx float")),
     ],

@@ -82,10 +82,17 @@ def test_vibrations_do_not_shift_the_delay_by_their_period(late):
     out = rollout(
         axis, dip, rest, rest, torch.as_tensor(tau[:-1]), sample_time=1e-4, gradients=False
     )
-    recording = Recording(time, quantise(out.q.numpy(), 1e-6), tau=tau, unit="m")[::10]
+    recording = Recording(time, quantise(out.q.numpy(), math.tau / 1e-6), tau=tau, unit="m")[::10]
     recording = recording._replace(tau=recording.torque_at(recording.time - late))
     task = prepare_task("coulomb-viscous", axis, recording, FitOptions(fit_delay=True))
     assert task.delay == pytest.approx(late, abs=5e-4)
+
+
+def test_delay_of_a_joint_at_rest_starts_from_zero():
+    recording = delayed()
+    still = recording._replace(q=np.zeros_like(recording.q))
+    axis, options = LinearAxis(2.0), FitOptions(fit_delay=True)
+    assert prepare_task("coulomb-viscous", axis, still, options).delay == 0
 
 
 def test_early_torques_are_doubtful_beside_a_residual():

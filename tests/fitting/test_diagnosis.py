@@ -48,6 +48,9 @@ DOUBLE = {"mass": [0.5, 0.3], "length": [0.3, 0.25], "com": [0.15, 0.12],
 MOTOR = {"mass": [1.0], "length": [0.3], "com": [0.15], "inertia": [0.0075], "armature": [0.05]}
 
 
+slow = functools.partial(pytest.param, marks=pytest.mark.slow)
+
+
 def torque(peaks: list[float], seed: int) -> np.ndarray:
     """Sums of sines with these peaks, (sample, joint)."""
     rng = np.random.default_rng(seed)
@@ -284,7 +287,7 @@ def test_play_in_a_gear_is_named(play, named):
 def test_fit_with_play_in_the_gear_is_doubtful():
     q, tau = geared(math.radians(1.0))
     recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
-    given = {"windows": (0.1,), "max_steps": 1}
+    given = {"windows": (0.1,), "max_steps": 5}
     found = fit(CVFM(1), PendulumChain(**MOTOR), recording, **given)
     assert found.usability[0] == "doubtful"
     assert "joint1 has play" in found.usability[1]
@@ -461,14 +464,14 @@ def test_a_torque_held_for_long_steps_is_no_delay():
         ("free", lambda q: q[:, ::-1], "the positions of joint1 and joint2 are exchanged"),
         ("free", lambda q: q + np.array([math.pi / 2, 0]), "joint1's position is 90 degrees off"),
         ("free", np.degrees, "positions are in degrees"),
-        ("free", lambda q: q * [4, 1], "4 times too large"),
+        slow("free", lambda q: q * [4, 1], "4 times too large"),
         ("free", lambda q: q[::-1], "time runs backwards"),
         ("driven", lambda q: q * [-1, 1], "the sign of joint1's position is reversed"),
         ("driven", lambda q: q + np.array([0, math.pi]), "joint2's position is 180 degrees off"),
-        ("driven", lambda q: later(q, 10), "positions are recorded 2"),
-        ("motor", np.degrees, "positions are in degrees"),
+        slow("driven", lambda q: later(q, 10), "positions are recorded 2"),
+        slow("motor", np.degrees, "positions are in degrees"),
         ("motor", lambda q: 5 * q, "too large (of the motor, before its gear)"),
-        ("driven", lambda q: 50 * q, "all positions are 50 times"),
+        slow("driven", lambda q: 50 * q, "all positions are 50 times"),
         ("axis", lambda q: 1e3 * q, "positions are in mm"),
     ],
 )  # fmt: skip
@@ -482,15 +485,19 @@ def test_mistakes_in_positions_are_named(name, change, finding):
     ("name", "change", "finding"),
     [
         ("driven", lambda tau: -tau, "every torque has the wrong sign"),
-        ("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
+        slow("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
         ("driven", lambda tau: tau * [3.0, 0.4], "different factors: that of joint1 is 3"),
-        ("driven", lambda tau: tau * [0.3, -1.0], "and that of joint2 has the wrong sign (torque"),
-        ("driven", lambda tau: tau[:, ::-1], "the torques of joint1 and joint2 are exchanged"),
+        slow(
+            "driven", lambda tau: tau * [0.3, -1.0], "and that of joint2 has the wrong sign (torque"
+        ),
+        slow("driven", lambda tau: tau[:, ::-1], "the torques of joint1 and joint2 are exchanged"),
         ("driven", lambda tau: later(tau, 10), "torques are recorded 18"),
         ("motor", lambda tau: tau / 0.12, "the torque of joint1 is 8.3"),
-        ("axis", lambda tau: -tau, "the force of joint1 has the wrong sign"),
+        slow("axis", lambda tau: -tau, "the force of joint1 has the wrong sign"),
         ("motor", np.abs, "the torque of joint1 is recorded without its sign"),
-        ("driven", lambda tau: np.abs(tau) * [1, 0] + tau * [0, 1], "joint1 is recorded without"),
+        slow(
+            "driven", lambda tau: np.abs(tau) * [1, 0] + tau * [0, 1], "joint1 is recorded without"
+        ),
     ],
 )
 def test_mistakes_in_torques_are_named(name, change, finding):
@@ -506,11 +513,11 @@ def test_mistakes_in_torques_are_named(name, change, finding):
         ("motor", {"inertia": [0.0075 + 0.15**2]}, "inertias are about the joints"),
         ("motor", {"mass": [1e3], "inertia": [7.5]}, "masses are in g"),
         ("free", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
-        ("motor", {"length": [300.0], "com": [150.0], "inertia": [7.5e3]}, "in kg mm^2"),
-        ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
+        slow("motor", {"length": [300.0], "com": [150.0], "inertia": [7.5e3]}, "in kg mm^2"),
+        slow("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
-        ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
-        ("driven", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
+        slow("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
+        slow("driven", {"inertia": [37.5, 15.6]}, "inertias are in kg cm^2"),
         # The same link without 0.05 kg at its end.
         (
             "driven",
@@ -518,7 +525,7 @@ def test_mistakes_in_torques_are_named(name, change, finding):
             "the link of joint2 carries 0.0491 kg at its end",
         ),
         ("wheel", {"motor": Motor(50, rotor_inertia=120)}, "each `rotor_inertia` is in g cm^2"),
-        (
+        slow(
             "driven",
             {
                 "mass": [500, 300],
@@ -793,7 +800,7 @@ def off_as_drawings_are(plant: Plant, seed: int, driven: Sequence[int] = ()) -> 
     return adjusted_plant(plant, terms, sizes * usual)
 
 
-@pytest.mark.parametrize("seed", [0, 2, 5])
+@pytest.mark.parametrize("seed", [0, slow(2), slow(5)])
 def test_delay_is_named_beside_errors_of_a_drawing(seed):
     plant, q, tau = measured("driven")
     drawn = off_as_drawings_are(plant, seed, driven=(0, 1))
@@ -823,7 +830,7 @@ def test_wrong_sample_rate_of_a_single_link_is_named_beside_its_inertia():
     assert "or the true sample rate is 2" in text
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, slow(1), slow(2)])
 def test_mistakes_are_named_beside_errors_of_a_drawing(seed):
     """Wrong terms of the rig would absorb both the mistake and these errors."""
     plant, q, tau = measured("motor")
@@ -1157,7 +1164,7 @@ def test_wrongly_scaled_torques_are_named(name):
 
 
 @pytest.mark.parametrize(
-    ("scale", "inertia", "named"), [(1.15, 1.06, True), (1.0, 1.08, False), (1.0, 1.25, False)]
+    ("scale", "inertia", "named"), [(1.15, 1.06, True), slow(1.0, 1.08, False), (1.0, 1.25, False)]
 )
 def test_torque_scale_is_named_despite_errors_of_the_rig(scale, inertia, named):
     """Only a common change of inertia and gravity beyond that of usual rig errors."""
@@ -1289,16 +1296,14 @@ def test_torque_noise_is_no_error_of_the_law():
     assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
 
 
-@pytest.mark.parametrize(
-    ("factor", "verdict"), [pytest.param(0.15, "good", marks=pytest.mark.slow), (0.3, "doubtful")]
-)
+@pytest.mark.parametrize(("factor", "verdict"), [slow(0.1, "good"), (0.3, "doubtful")])
 def test_small_error_is_not_doubtful_with_a_fine_encoder(factor, verdict):
     """An error of the law is judged relative to the motion, however fine the encoder is."""
     plant, fine, tau = measured("wheel", COUNT / 1024)
     # A driver whose gain grows with its torque, an effect that no plant term has.
     recording = Recording(STEP * np.arange(len(fine)), fine, np.sinh(factor * tau) / factor)
     found = fit(CVFM(1), plant, recording, windows=(1.0,), fit_plant=False)
-    assert found.residual > 30 * found.noise
+    assert found.residual > 10 * found.noise
     assert found.usability[0] == verdict
 
 

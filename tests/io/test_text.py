@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from nfriction.io.formats.text import parse_csv
 from nfriction.recording import Recording, RecordingWarning
 
 TIME = np.arange(20) / 1000
@@ -83,12 +84,35 @@ def test_columns_are_mapped_with_their_units(tmp_path: Path) -> None:
         np.testing.assert_allclose(read(tmp_path, text, columns=names).q, np.deg2rad(Q), rtol=4e-16)
 
 
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        (",time,q1\n-,s,rad\n", "{k},{k}.0,0.5\n"),
+        ("time,q1,,tau1\n[s],[rad],[-],[Nm]\n", "{k},0.5,7,1.5\n"),
+        ("time,q1,tau1,state\n", "{k},0.5,1.5,ok\n"),
+        ("time;q1;\n", "{k},5;1.234,6;1.234,7\n"),
+        ("Range;0;10\nDate;29.11.2026\ntime;q1\n", "{k},5;0,5\n"),
+    ],
+)
+def test_first_row_of_names_above_numbers_is_the_header(
+    tmp_path: Path, head: str, row: str
+) -> None:
+    text = head + "".join(row.format(k=k) for k in range(12))
+    assert {"time", "q1"} <= {*parse_csv(text).columns}
+    # Also with a line of text at the end, which may have more cells.
+    assert {"time", "q1"} <= {*parse_csv(text + "end\n").columns}
+
+
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_titles_above_the_header_are_skipped(tmp_path: Path, separator: str) -> None:
     title = f"Bench 7{2 * separator}\n\nsecond run\n"
     assert np.array_equal(read(tmp_path, title + written(separator, False)).q, Q)
     settings = f"Rate [Hz]{separator}1000\nStarted{separator}29.11.2026\n\n"
     assert np.array_equal(read(tmp_path, settings + written(separator, False)).q, Q)
+    units = f"{separator}".join(["s", "rad", "rad"])
+    name = written(separator, False).split("\n", 1)
+    assert np.array_equal(read(tmp_path, f"{name[0]}\n{units}\n{name[1]}").q, Q)
+    assert np.array_equal(read(tmp_path, f"{settings}{name[0]}\n{units}\n{name[1]}").q, Q)
     # A single word is no header of a table, and neither are numbers.
     with pytest.raises(ValueError, match=r"header|missing"):
         read(tmp_path, written(separator, False, header="time"))

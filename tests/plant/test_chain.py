@@ -244,7 +244,7 @@ def test_replace_keeps_the_original_and_refuses_unknown_names() -> None:
         rigs.tlrip("free").replace(drag_linear=torch.ones(3))
 
 
-@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("arm", [ARMS[0], pytest.param(ARMS[1], marks=pytest.mark.slow)])
 def test_export_traces_to_core_operations(arm: Any) -> None:
     rig = with_encoders(every_kind(arm))
     program = torch.export.export(rig, states(rig.joints, (7,), seed=1)).run_decompositions()

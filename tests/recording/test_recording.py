@@ -365,7 +365,7 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
     [
         ({"q": np.zeros(60)}, r"`q` must be \(time, joint\), got shape \(60,\).*q\[:, None\]"),
         ({"q": [[0.0, 1.0], [2.0]]}, "`q` must be a rectangular array"),
-        ({"q": poked((60, 2), (7, 1), np.nan)}, "`q2` must be finite, .* nan at sample 7 .*drop"),
+        ({"q": poked((60, 2), (7, 1), np.nan)}, "`q2` must be finite, .* nan at sample 7 .*remove"),
         ({"tau": poked((60, 2), (9, 0), np.inf)}, "`tau1` must be finite, got inf at sample 9"),
         ({"tau": np.zeros((60, 1))}, r"`tau` must be shaped like `q` \(60, 2\)"),
         ({"qd": np.zeros((59, 2))}, "`qd` must be shaped like"),

@@ -57,7 +57,10 @@ class Samples:
     source: Source
 
     def late(self, delay: float, drift: float = 0.0) -> "Samples":
-        """With the torque that was recorded `delay` [s] later, which grows by `drift` [-]."""
+        """With the torque that was recorded `delay` [s] later, which grows by `drift` [-].
+
+        Of the recordings as given: changes of the samples are lost.
+        """
         return collect(self.source, delay, drift)
 
     def held(self, delay: float) -> bool:
@@ -258,7 +261,7 @@ def least_unexplained(
 
     # The valley is as wide as a swing, so that a coarse grid finds it.
     grid = np.linspace(lowest, highest, count)
-    square = np.square([unexplained(x) for x in grid])
+    square = np.nan_to_num(np.square([unexplained(x) for x in grid]), nan=math.inf)
     beside = np.pad(square, 1, constant_values=math.inf)
     valleys = (square < beside[:-2]) & (square <= beside[2:]) & (square <= 16 * square.min())
     # Vibrations make several valleys, of which a grid shows the depth only about.

@@ -168,12 +168,12 @@ def corrected_rigs(plant: Plant, driven: bool) -> Iterator[tuple[str, Plant]]:
     if inertia.ndim == 1 and len(inertia):
         central = inertia - np.array(data["mass"]) * np.array(data["com"]) ** 2
         changes["inertias are about the joints, not about the mass centres"] = {"inertia": central}
-    tried: list[dict[str, Any]] = []
+    alike: list[dict[str, Any]] = []
     for text, change in changes.items():
         parts = {key: values.tolist() for key, values in change.items()}
         # A rig without inertias has them in no wrong unit.
-        if change and change.keys() <= given.keys() and parts not in tried:
-            tried.append({**parts})
+        if change and change.keys() <= given.keys() and parts not in alike:
+            alike.append({**parts})
             if motor:
                 parts["motor"] = motor | {k: parts.pop(k) for k in motor if k in parts}
             # Some would be no mechanism, or a strange one.
@@ -465,7 +465,7 @@ def geared(plant: Plant, convention: AngleConvention, given: Samples) -> Iterato
     q = convention.position_from_joint(given.q.numpy(), first)
     rates = [convention.rate_from_joint(x.numpy(), first) for x in (given.qd, given.qdd)]
 
-    def geared(x: float, group: Array, drive: Array) -> float:
+    def share_at(x: float, group: Array, drive: Array) -> float:
         scale = np.exp(-x * group)
         at = torch.as_tensor(convention.position_to_joint(q * scale, first))
         qd, qdd = (torch.as_tensor(convention.rate_to_joint(r * scale, first)) for r in rates)
@@ -478,14 +478,14 @@ def geared(plant: Plant, convention: AngleConvention, given: Samples) -> Iterato
     alone = [(f"{name}'s position is", eye[j]) for j, name in enumerate(plant.joint_names)]
     for what, group in (*alone, *every):
         ratio, share = least_unexplained(
-            partial(geared, group=group, drive=0 * group), *LOG_RATIOS, 41
+            partial(share_at, group=group, drive=0 * group), *LOG_RATIOS, 41
         )
         text = f"{what} {math.exp(ratio):.3g} times too large (of the motor, before its gear)"
         yield Mistake(text, share)
     for j in given.driven if plant.motor is not None else ():
         most = math.log(4.0)  # ratios within a series of gears
         ratio, share = least_unexplained(
-            partial(geared, group=eye[j], drive=eye[j]), -most, most, 17
+            partial(share_at, group=eye[j], drive=eye[j]), -most, most, 17
         )
         name = plant.joint_names[j]
         text = f"the gear ratio of {name} is {math.exp(ratio):.3g} times that of the rig"
@@ -506,7 +506,7 @@ def balanced_delay(plant: Plant, given: Samples) -> tuple[float, float]:
     most, options = given.options.largest_delay, given.options
     # Vibrations of a controlled joint make narrow valleys; block means show none that are faster.
     step = max(2 * given.recordings[0].sample_time, 0.1 * options.diagnosis_block)
-    count = 1 + 2 * math.ceil(most / step)
+    count = max(9, 1 + 2 * math.ceil(most / step))
     return least_unexplained(lambda x: unexplained_share(plant, given.late(x)), -most, most, count)
 
 

@@ -86,7 +86,7 @@ def likely_mistakes(
         return stated, tuple(stops)
     # With different zeros, recordings of the same rig have different balances.
     unlike = [*_unlike_zeros(plant, given)] if len(recordings) > 1 else []
-    found = [] if zeroed else [*unlike]
+    found = [] if zeroed else unlike.copy()
     if noise < stated:
         zeros = min((x.unexplained for x in unlike), default=math.inf)
         found += _above_noise(plant, convention, given, zeros, presliding)

@@ -186,7 +186,9 @@ class FitResult:
         # Uniform motion needs no torque, so a model that follows it explains nothing.
         degree, moves = 0 if falls else 1, []
         for m in self.motions:
-            pieces = max(1, round(float(m.time[-1] - m.time[0]) / length))
+            # A trend passes through two samples.
+            pieces = min(round(float(m.time[-1] - m.time[0]) / length), len(m.time) // 3)
+            pieces = max(1, pieces)
             for time, q in zip(*(np.array_split(x, pieces) for x in (m.time, m.q)), strict=True):
                 trend = np.vander(time - time.mean(), degree + 1)
                 moves.append(q - trend @ np.linalg.lstsq(trend, q, rcond=None)[0])
@@ -199,9 +201,10 @@ class FitResult:
         # A recording at rest has no motion for comparison.
         far = "the residual is larger than the motion"
         if wrong and self.residual < motion:
+            where = " within windows" * bool(self.stages)
             far = (
                 f"the residual is {100 * self.residual / motion:.2g} % of the motion's standard "
-                f"deviation, and {self.residual / noise:.0f} times the measurement noise"
+                f"deviation{where}, and {self.residual / noise:.0f} times the measurement noise"
             )
         reasons = [f"a mistake in data or rig is likely: {x}" for x in self.mistakes[:1]]
         # A regression on torques simulates no motion that could excuse a mistake.

@@ -133,17 +133,32 @@ def _is_comment(line: str) -> bool:
 
 
 def _without_title(lines: list[str]) -> list[str]:
-    """The lines from the header on, which fills more cells than titles before it."""
-    row = lines[min(len(lines), MOST_TITLES) - 1]
-    separator = next((s for s in _SEPARATORS if s in row), None)
-    cells = [[c for c in line.split(separator) if c.strip()] for line in lines[:MOST_TITLES]]
-    # Settings of a logger, such as a date beside its name, fill fewer cells than the header.
-    for least in (max(map(len, cells)), 2):
-        header = next((k for k, filled in enumerate(cells) if len(filled) >= least), 0)
-        # A header of one word is followed by numbers.
-        if not any(is_number(cell.replace(",", ".")) for cell in cells[header]):
-            return lines[header:]
+    """The lines from the header on, below titles and settings of a logger.
+
+    The header is the first line of words that names all columns of the first row of numbers but
+    one; without such a row, the first line with several cells.
+    """
+    head = lines[:MOST_TITLES]
+    usual = (s for s in _SEPARATORS if 2 * sum(s in line for line in head) > len(head))
+    separator = next(usual, None)
+    cells = [[c.strip() for c in line.split(separator) if c.strip()] for line in head]
+    first = next((k for k, row in enumerate(cells) if _are_numbers(row)), 0)
+    for least, rows in ((max(2, len(cells[first]) - 1), cells[:first]), (2, cells)):
+        for k, row in enumerate(rows):
+            if len(row) >= least and not any(map(_is_numeric, row)):
+                return lines[k:]
     return lines
+
+
+def _is_numeric(cell: str) -> bool:
+    """True for numbers with any signs for decimals and thousands, and for dates."""
+    return re.fullmatch(r"[-+]?[\d.,]*\d[\d.,]*(e[-+]?\d+)?", cell, re.IGNORECASE) is not None
+
+
+def _are_numbers(cells: list[str]) -> bool:
+    """True for a row of numbers, which may contain some text; a setting begins with a word."""
+    found = [*map(_is_numeric, cells)]
+    return len(found) > 1 and found[0] and 2 * sum(found) > len(found)
 
 
 def _separator(header: str, rows: list[str]) -> str:
