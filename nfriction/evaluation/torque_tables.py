@@ -719,9 +719,11 @@ def _saved(path: Path) -> list[SavedModel]:
     model, info = load(path), load_info(path)
     names = info.joint_names or [f"joint{k + 1}" for k in range(model.joints)]
     unit: Unit = "m" if info.unit == "m" else "rad"
-    errors = info.fit.get("blocks_left_out", {})
-    return [SavedModel(name, unit, one, float(errors.get(name) or math.nan))
-            for name, one in zip(names, split(model), strict=True)]  # fmt: skip
+    given = info.fit.get("blocks_left_out")
+    errors = [given.get(name) if isinstance(given, dict) else None for name in names]
+    left_out = [x if isinstance(x, float) else math.nan for x in errors]
+    return [SavedModel(name, unit, one, error)
+            for name, one, error in zip(names, split(model), left_out, strict=True)]  # fmt: skip
 
 
 def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFrame:

@@ -117,10 +117,10 @@ def prepare_task(
         if not inputs.largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
         # A search by simulation finds the delay only from a start within a cycle of the motion.
-        given_times = collect(Source(joint, moved, options))
-        delay, share = balanced_delay(plant, given_times)
+        samples = collect(Source(joint, moved, options))
+        delay, share = balanced_delay(plant, samples)
         # Vibrations, or a wrong law, have valleys at other delays that are hardly lower.
-        if not options.diagnosis_tie * share < unexplained_share(plant, given_times):
+        if not options.diagnosis_tie * share < unexplained_share(plant, samples):
             delay = 0.0
     advanced = inputs.advanced_torques(joint, delay)
     # With the delay removed, so that it is not reported again as a mistake.
