@@ -64,7 +64,7 @@ class Samples:
         return collect(self.source, delay, drift)
 
     def held(self, delay: float) -> bool:
-        """A torque that is held until the next sample acts up to one step late."""
+        """True if it is explained by holding a torque until the next sample, up to one step."""
         return -max(r.sample_time for r in self.recordings) <= delay <= 0
 
     @property
@@ -162,8 +162,16 @@ def unexplained_share(plant: Plant, data: Samples, extra: Tensor | None = None) 
     Root mean square over joints, relative to the sum of squares of the torques of drive, gravity
     and inertia, without their means where a drive may have an offset.
     """
+    return share_and_factors(plant, data, extra)[0]
+
+
+def share_and_factors(
+    plant: Plant, data: Samples, extra: Tensor | None = None
+) -> tuple[float, Tensor]:
+    """`unexplained_share` with the factors of `extra` torques, (column,)."""
     needed = data.needed(plant)
-    return torque_share(plant, data, solve_balance(data, data.tau - needed, extra)[0], needed)
+    left, factors = solve_balance(data, data.tau - needed, extra)
+    return torque_share(plant, data, left, needed), factors
 
 
 def noise_share(plant: Plant, data: Samples, sd: Tensor) -> float:

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.data.inputs import names_of
@@ -19,8 +18,6 @@ from nfriction.fitting.result.paired_test import improves, jackknife_sd, student
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-
-Array = NDArray[np.float64]
 
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
@@ -37,10 +34,8 @@ def changing_friction(
     its estimates with each piece of the sliding left out, and to predict the torque of these
     pieces: in a short motion, time and falling speed look alike.
     """
-    data, pieces = (
-        collect(Source(recordings, motions, options)),
-        options.drift_pieces * len(recordings),
-    )
+    data = collect(Source(recordings, motions, options))
+    pieces = options.drift_pieces * len(recordings)
     if len(data.q) < 2 * pieces * data.block:
         return
     time, number = data.mean(data.time), data.mean(data.number.to(data.time))

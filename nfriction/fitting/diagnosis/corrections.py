@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_plant
 from nfriction.fitting.data.inputs import names_of, weighs
@@ -21,6 +22,7 @@ from nfriction.fitting.diagnosis.balance import (
     best_amount,
     least_unexplained,
     noise_share,
+    share_and_factors,
     solve_balance,
     torque_share,
     unexplained_share,
@@ -385,36 +387,39 @@ def elastic(plant: Plant, given: Samples) -> Iterator[Mistake]:
     place = torch.arange(given.block).to(given.q) - (given.block - 1) / 2
     place *= given.recordings[0].sample_time
     parabola = place.square() - place.square().mean()
-    needed = given.needed(plant)
-    blocks = needed.reshape(-1, given.block, plant.joints)
+    blocks = given.needed(plant).reshape(-1, given.block, plant.joints)
     curvature = 2 * torch.einsum("bsj,s->bj", blocks, parabola) / parabola.square().sum()
     curvature = curvature.repeat_interleave(given.block, 0)
     for j in given.driven:
-        part = torch.where(torch.arange(plant.joints) == j, curvature, 0.0)
-        ratio = -float(solve_balance(given, given.tau - needed, part)[1])
+        share, ratio = _with_torque(plant, given, j, curvature)
         if ratio > 0:
             text = (
                 f"{plant.joint_names[j]} is elastic or has play between drive and encoder "
                 f"(resonance near {1 / (math.tau * math.sqrt(ratio)):.2g} Hz), which a rigid rig "
                 "cannot follow"
             )
-            yield Mistake(text, unexplained_share(plant, given, part))
+            yield Mistake(text, share)
 
 
 def springs(plant: Plant, given: Samples) -> Iterator[Mistake]:
     """Each driven joint with a spring to the frame, whose rest is anywhere."""
-    needed = given.needed(plant)
     for j in given.driven:
-        part = torch.where(torch.arange(plant.joints) == j, given.q, 0.0)
-        stiffness = -float(solve_balance(given, given.tau - needed, part)[1])
+        share, stiffness = _with_torque(plant, given, j, given.q)
         unit = f"{plant.effort_unit}/{plant.unit}"
         name = plant.joint_names[j]
         text = (
             f"{name} has a spring of {stiffness:.3g} {unit} that the rig lacks (subtract stiffness "
-            f"times position from the {plant.effort} of {name}), or it hardly slides "
-            "and its contact is elastic (fit a law with memory, such as `dahl`)"
+            f"times position from the {plant.effort} of {name}), or it hardly slides and its "
+            "contact is elastic (fit a law with memory, such as `dahl`)"
         )
-        yield Mistake(text, unexplained_share(plant, given, part))
+        yield Mistake(text, share)
+
+
+def _with_torque(plant: Plant, given: Samples, j: int, torque: Tensor) -> tuple[float, float]:
+    """Unexplained share with a torque (sample, joint) at one joint, and its factor in the drive."""
+    part = torch.where(torch.arange(plant.joints) == j, torque, 0.0)
+    share, factors = share_and_factors(plant, given, part)
+    return share, -float(factors)
 
 
 def unbalanced(plant: Plant, given: Samples) -> Iterator[Mistake]:
