@@ -337,6 +337,33 @@ def test_sets_adapt_and_evidence_rises_if_even_sets_are_wrong(
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)
 
 
+@pytest.mark.parametrize(("factor", "goes_on"), [(0.98, True), (1.02, False)])
+def test_training_goes_on_for_gains_below_their_scatter(
+    where_even_sets_are_wrong, monkeypatch, factor, goes_on
+):
+    rounds, judged = [], Validation.judged
+
+    def further(self, trial, noise, stride, *, learn_sets):
+        rounds.append(trial)
+        return replace(trial, prior_sd=math.nan)  # another trial
+
+    def scattered(self, trial):
+        found = judged(self, trial)
+        if not rounds:
+            return found
+        # Without a mean gain but for the factor.
+        spread = torch.where(torch.arange(len(found.squares)) % 2 > 0, 2.0, 0.5)
+        return replace(found, squares=factor * spread * rounds[0].squares)
+
+    monkeypatch.setattr(Validation, "_adapted", further)
+    monkeypatch.setattr(Validation, "judged", scattered)
+    model = NFNCFM(1, terms=(3, 1), head_units=1, inputs=())
+    settings = {"windows": (0.5,), "fit_plant": False, "drag": False, "max_steps": 2}
+    fit(model, ARM, where_even_sets_are_wrong, **settings)
+    # A round holds the sets, then moves them; the second one gains nothing.
+    assert len(rounds) == (4 if goes_on else 2)
+
+
 def test_stop_during_further_training_keeps_the_accepted_network(where_even_sets_are_wrong):
     names = []
 

@@ -3,8 +3,8 @@
 First, the network is trained with fixed sets, and hold-out windows select the priors. Training
 continues with the residual noise, with the prior of each group of parameters set by evidence, and
 moves the sets if the evidence favours that; this is repeated with ever smaller noise as long as the
-hold-out windows improve. Every window is held out in turn, and a gain must exceed its scatter over
-windows. Further inputs (`inputs`) are kept if a network with them, trained alike, is better on
+hold-out windows improve. Every window is held out in turn, and the gain over the law must exceed
+its scatter. Further inputs (`inputs`) are kept if a network with them, trained alike, is better on
 hold-out windows. With several recordings, none may be worse on hold-out recordings.
 """
 
@@ -26,7 +26,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import improves
+from nfriction.fitting.result.paired_test import improves, mean_gain
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -487,7 +487,8 @@ class Validation:
         gained = log_evidence(moved.end) - log_evidence(held.end)
         better = moved if gained > self.options.evidence_gain else held
         judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
-        if improves(judged.squares, trial.squares):
+        # The gain need not exceed its scatter: the last rounds of training each gain little.
+        if mean_gain(judged.squares, trial.squares)[0] > 0:
             return judged
         return judged if explained and not improves(trial.squares, judged.squares) else trial
 
