@@ -260,6 +260,7 @@ class Recording:
     ) -> Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
+        Rows without a number in a column that is read are left out; most rows must have them all.
         If some joints have a torque, the others are taken to be undriven, with zero torque.
         Velocity is read if every joint has it; other columns are ignored. In place of q1 and tau1
         the table may have motor1, the angle of the joint's motor [rad], and current1 [A], which the
@@ -279,8 +280,8 @@ class Recording:
             name: of the recording.
             plant: the mechanism, for its motors.
         Warns:
-            RecordingWarning: velocity or torque of some joints only, unread columns that look like
-                torque; and as `Recording`.
+            RecordingWarning: rows that are left out, velocity or torque of some joints only, unread
+                columns that look like torque; and as `Recording`.
         """
         _check_columns(columns)
         if not hasattr(table, "attrs"):

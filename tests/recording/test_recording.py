@@ -290,7 +290,6 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("time,q1\n0,0,1\n1,2,3\n", "more cells than its header"),
         ("# unit: deg\ntime,q1\n" + "0,0\n" * 9, "`unit` must be 'rad' or 'm', got 'deg'"),
         ("# convention: odd\ntime,q1\n" + "0,0\n" * 9, "`convention` must be one of"),
-        ("time,q1,q2\n" + "".join(f"{k},0,0\n" for k in range(9)) + "9,0\n", "`q2` .*sample 9"),
     ],
 )
 def test_malformed_csv_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -832,3 +831,26 @@ def test_masked_samples_count_as_missing() -> None:
     with pytest.raises(ValueError, match=r"`q1` must be finite, .* nan at sample 3"):
         Recording(time, masked)
     assert len(Recording(time, np.ma.masked_array(q))) == 20
+
+
+def test_rows_without_a_number_are_left_out_with_a_warning() -> None:
+    time = 2e-3 * np.arange(1000)
+    table = pd.DataFrame({"t": time, "enc": np.cos(time), "cur": np.sin(time)})
+    table.loc[100:109, "enc"] = np.nan
+    table.loc[900, "cur"] = np.nan
+    columns = {"time": "t", "q1": "enc", "tau1": "cur"}
+    with pytest.warns(RecordingWarning, match=r"11 of 1000 rows .* row 100\) .* in enc, cur, so"):
+        read = Recording.from_pandas(table, columns=columns)
+    kept = table.dropna()
+    assert np.array_equal(read.time, kept["t"])
+    assert np.array_equal(read.q[:, 0], kept["enc"])
+    assert read.tau is not None
+    assert np.array_equal(read.tau[:, 0], kept["cur"])
+
+
+def test_columns_of_different_rates_are_refused() -> None:
+    time = 1e-3 * np.arange(100)
+    table = pd.DataFrame({"time": time, "q1": time})
+    table.loc[np.arange(100) % 3 > 0, "q1"] = np.nan
+    with pytest.raises(ValueError, match=r"66 of 100 rows .* in q1; log all columns at one rate"):
+        Recording.from_pandas(table)

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nfriction.io.formats.numbers import THOUSANDS, Array, column_numbers
 
@@ -130,10 +131,32 @@ def table_arrays(
     kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
-    remarks = (*undecided, *_remarks(table, sources, joints))
+    remarks = [*undecided, *_remarks(table, sources, joints)]
+    complete = np.all([~np.isnan(np.c_[x]).any(axis=1) for x in arrays.values()], axis=0)
+    if not complete.all():
+        remarks.append(_incomplete_rows(table, sources, complete))
+        arrays = {key: values[complete] for key, values in arrays.items()}
     of_motors = any(source.motor == "motor" for source in sources.values())
     has_unit = degrees or all(source.unit for source in positions)
-    return Arrays(arrays, kinds.pop() if kinds else None, remarks, of_motors, has_unit)
+    return Arrays(arrays, kinds.pop() if kinds else None, tuple(remarks), of_motors, has_unit)
+
+
+def _incomplete_rows(
+    table: pd.DataFrame, sources: dict[str, Source], complete: NDArray[np.bool_]
+) -> tuple[str, str]:
+    """A remark on rows without a number in some column; ValueError if most rows are."""
+    columns = dict.fromkeys(source.column for source in sources.values())
+    empty = [name for name in columns if np.isnan(column_numbers(table, name)).any()]
+    # Counted from 0 below the header.
+    finding = (
+        f"{(~complete).sum()} of {len(complete)} rows (the first is row {np.argmin(complete)}) "
+        f"have no number in {', '.join(empty)}"
+    )
+    if 2 * complete.sum() < len(complete):
+        raise ValueError(
+            f"{finding}; log all columns at one rate, or interpolate them to common time stamps."
+        )
+    return f"{finding}, so they are left out", "fill them if these columns are sampled less often"
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
