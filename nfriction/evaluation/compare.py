@@ -25,6 +25,7 @@ from nfriction.fitting.data.inputs import (
 from nfriction.fitting.diagnosis.mistakes import likely_mistakes, mistake_warning, unlike_training
 from nfriction.fitting.options import DEFAULTS, checked_lengths
 from nfriction.fitting.result.fit_result import UNIFORM_TURN, FitResult
+from nfriction.fitting.strategy.inputs import known_positions
 from nfriction.friction import both_names, model_name
 from nfriction.friction.heat import HEAT
 from nfriction.friction.models import FrictionModel
@@ -43,7 +44,7 @@ SCHEMA = 4
 of the `limit`, the first no number and `held_out` in place of `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
-# Share of a test recording's samples that may be faster than all training samples.
+# Share of a test recording's samples that may be faster or farther than all training samples.
 FASTER = 0.01
 # An error this many times that of a model no larger cannot be chance in a few test recordings.
 FAR_WORSE = 2.0
@@ -447,6 +448,7 @@ def compare(
         progress.resume()
     # Fits without heat come first: their friction depends on the current motion alone.
     named = min(fits, key=lambda name: (fits[name].model.state_size, fits[name].residual))
+    warned += _warned(_farther(fits, tested))
     warned += _warned(_mistakes(plant, fits[named], data, tested, faster=bool(warned)))
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
@@ -564,6 +566,24 @@ def _faster(plant: Plant, train: Data, test: Data) -> Iterator[str]:
             f"{', '.join(found)}; train on motions as fast as those to be simulated, in both "
             "directions."
         )
+
+
+def _farther(fits: Mapping[str, FitResult], test: Data) -> Iterator[str]:
+    """A sentence for each fit whose friction by position is extrapolated in tests."""
+    for model, fit in fits.items():
+        low, high = known_positions(fit.plant, fit.motions)
+        found = [
+            f"{fit.plant.joint_names[j]} of {recording.name or 'a recording'} "
+            f"({moved.q[:, j].min():.3g} to {moved.q[:, j].max():.3g} against "
+            f"{low[j]:.3g} to {high[j]:.3g} {fit.plant.unit})"
+            for recording, moved in zip(*test, strict=True)
+            for j in np.flatnonzero(((moved.q < low) | (moved.q > high)).mean(axis=0) > FASTER)
+        ]
+        if found:
+            yield (
+                f"{model}: its friction by position is extrapolated to positions that no training "
+                f"recording reaches: {', '.join(found)}; train on the whole range."
+            )
 
 
 def _usual_speed(motion: Motion, sign: int) -> np.ndarray:

@@ -414,6 +414,13 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
     # Half a step of a coarse sensor is no error, and neighbouring readings are a step apart.
     least = max(small, 1.5 * float(np.diff(np.unique(joint.tau)).min(initial=math.inf)))
     if joint.time is not None:
+        size = _of_load(joint, error)
+        if not torque_table.reads_load(model) and size > small:
+            yield (
+                f"{size:.3g} {'N m' if unit == 'rad' else 'N'} (root mean square) of the error of "
+                f"{own} follow the load, which the intervals do not cover. Try a law of the load "
+                "(load-coulomb, load-slip) or one of your own."
+            )
         # Along a motion the torques before and after a mistake agree with each other.
         sound = np.median([joint.tau[:-2], joint.tau[1:-1], joint.tau[2:]], axis=0)
         usual = joint.tau - np.median(joint.tau)
@@ -448,6 +455,21 @@ def _doubts(joint: JointTorque, model: FrictionModel, unit: str) -> Iterator[str
         )
     elif len(far):
         yield _listed(joint, far, own, unit)
+
+
+def _of_load(joint: JointTorque, error: Array) -> float:
+    """Root mean square of the error that follows the load, beyond chance over blocks; or 0."""
+    if joint.load is None:
+        return 0.0
+    sign, speed = np.sign(joint.qd), np.abs(joint.qd)
+    odd = sign[:, None] * np.stack([speed**0, speed, np.sqrt(speed)], 1)
+    given = np.stack([error, sign * joint.load], 1)
+    error, cause = (given - odd @ np.linalg.lstsq(odd, given, None)[0]).T
+    parts = blocks(joint, min(FOLDS, len(joint)))
+    plain, left = (_left_out(error, x, parts) for x in (np.zeros_like(error), cause))
+    if not improves(left, plain, DEFAULTS.input_chance):
+        return 0.0
+    return math.sqrt(float((cause @ error) ** 2 / (cause @ cause)) / len(error))
 
 
 def _beyond(x: Array, usual: Array, least: float) -> NDArray[np.intp]:

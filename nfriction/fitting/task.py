@@ -95,7 +95,7 @@ def prepare_task(
     floor, wanted = inputs.turning_velocity(plant, joint, moved)
     if by_name:
         model.v_smooth = floor
-    blurred = model.v_smooth == floor > wanted
+    blurred = model.v_smooth == floor > wanted and _has_sign(model.law)
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
@@ -164,6 +164,13 @@ def prepare_task(
         (inputs.SMOOTHED.format(floor, wanted),) * blurred,
         first.ratios if first is not None and corrected else {},
     )  # fmt: skip
+
+
+def _has_sign(law: Law) -> bool:
+    """True if the friction is smoothed around zero velocity."""
+    ones = torch.ones(1, len(law.names), dtype=torch.float64)
+    steep, smooth = (law.torque(ones[:, 0], ones[:, 0], ones, v_smooth) for v_smooth in (1.0, 2.0))
+    return not torch.equal(steep, smooth)
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:

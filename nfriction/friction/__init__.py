@@ -61,7 +61,9 @@ _ALL = (
     | {"NFSlip": (_KIND_OF_RECORDED, "slip")}
 )
 _BY_TEXT = {
-    text.lower(): name for name, (kind, law) in _ALL.items() for text in (name, kind.prefix + law)
+    text.lower(): name
+    for name, (kind, law) in _ALL.items()
+    for text in (name, kind.prefix + law, kind.prefix + _LAWS.get(law, law))
 }
 
 # Models of laws of one's own, see `add_law`.

@@ -388,7 +388,10 @@ def _figures(
     if given:
         motions = [trained[r.name] for r in given]
         bands = {n: f.uncertainty for n, f in comparison.fits.items() if f.uncertainty is not None}
-        figure = torque_over_velocity(last.plant, models, given, motions, uncertainty=bands)
+        plants = {name: found.plant for name, found in comparison.fits.items()}
+        figure = torque_over_velocity(
+            last.plant, models, given, motions, uncertainty=bands, plants=plants
+        )
         yield "torque_over_velocity", figure
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
     # Constants along the motion are worth drawing only with coefficients that follow it.

@@ -43,12 +43,14 @@ def torque_over_velocity(
     motions: Sequence[Motion] | None = None,
     *,
     uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
+    plants: Mapping[str, Plant] | None = None,
 ) -> Figure:
     """Friction torque of each law over velocity, one panel per joint, over that of the motion.
 
-    Lines are at the load at rest and without acceleration, with 95 % bands; dots are
-    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint does not
-    reverse. Medians and quartiles in velocity bins show the friction where dots scatter widely.
+    Lines are at the median load (or, for a gear, without torque), without acceleration and cold,
+    with 95 % bands; dots are `tau - M qdd - bias` along the recordings, averaged over 30 ms in
+    which the joint does not reverse. Medians and quartiles in velocity bins show the friction where
+    dots scatter widely.
 
     Args:
         plant: the mechanism, with its fitted terms if there are any.
@@ -56,10 +58,12 @@ def torque_over_velocity(
         recordings: in any convention.
         motions: their smoothed motion in joint coordinates; computed if not given.
         uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
+        plants: of the models' fits by name, for their loads; `plant` if not given.
     """
     joint = [r.joint_coordinates(plant) for r in recordings]
     motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
     known = uncertainty or {}
+    loads = {name: _median_load((plants or {}).get(name, plant), motions) for name in models}
     with torch.no_grad():
         parts = [
             _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
@@ -70,7 +74,7 @@ def torque_over_velocity(
     looks = style.looks(models)
     for k, ax in enumerate(axes):
         grid = velocities(qd[:, k])
-        lines = {name: _torque(model, grid, k) for name, model in models.items()}
+        lines = {name: _torque(model, grid, k, loads[name]) for name, model in models.items()}
         seen = np.flatnonzero(np.isfinite(torque[:, k]))
         binned = _binned(qd[seen, k], torque[seen, k])
         # Dots may scatter far beyond the friction, so laws and quartiles set the limits.
@@ -143,12 +147,19 @@ def velocities(qd: Array) -> Array:
     return grid[(grid >= low) & (grid <= high)]
 
 
-def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Torque of one joint over its velocity, at the load at rest and without acceleration."""
+def _median_load(plant: Plant, motions: Sequence[Motion]) -> torch.Tensor:
+    """Median load of each joint along motions, (joint,)."""
+    loads = [plant.load(torch.as_tensor(m.q), torch.as_tensor(m.qd)) for m in motions]
+    return torch.cat(loads).median(0).values
+
+
+def _torque(model: FrictionModel, qd: Array, joint: int, load: torch.Tensor) -> Array:
+    """Torque of one joint over its velocity at a load (joint,), without acceleration."""
     velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
     with torch.no_grad():
         held = model.coefficients(velocity, torch.zeros_like(velocity))
-        torque = model.steady_torque(velocity, load_at_rest(model.law, velocity), held)
+        loads = load_at_rest(model.law, velocity) * load
+        torque = model.steady_torque(velocity, loads, held)
     return torque[:, joint].numpy()
 
 

@@ -148,7 +148,8 @@ def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
 # In the order of the page: friction and errors first, then motions, then details of the models.
 _CAPTIONS = {
     "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
-    "over the torque that the recorded motion implies, averaged over 30 ms, and its medians",
+    "at the median load, over the torque that the recorded motion implies, averaged over 30 ms, "
+    "and its medians",
     "rmse_test": "Position error by model and joint, test recordings",
     "horizons_test": "Position error over the length of the simulation, test recordings; the band "
     "is the limit of these data, the effect of noise in start and torque and of the integration",

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from nfriction import CVFM, LFM, NFLFM, LinearAxis, PendulumChain, Recording, Rotor, compare
 from nfriction.cli.tables import error_tables, fit_lines, verdict
-from nfriction.evaluation.compare import Comparison, Fits, coefficient_summary
+from nfriction.evaluation.compare import Comparison, Data, Fits, _farther, coefficient_summary
 from nfriction.evaluation.parallel import Progress
 from nfriction.evaluation.results import write_results
 from nfriction.evaluation.score import RMSE, Errors, Score
@@ -157,6 +158,19 @@ def test_test_recording_faster_than_all_training_data_is_named(recwarn):
     assert not [w for w in recwarn if "extrapolated" in str(w.message)]
     with pytest.warns(UserWarning, match=r"joint1 of a \(8.79 against 6.08 rad/s\), joint2 of a"):
         compare(pendulum(), "NCFM", B, A, **settings)
+
+
+@pytest.mark.parametrize(("waves", "reach", "named"), [(2, 1.4, 1), (2, 1.6, 0), (0, 1.0, 0)])
+def test_positions_without_training_data_are_named(waves, reach, named):
+    """Unless training covers a whole period of the friction by position, or there is none."""
+    time = np.linspace(0.0, 1.0, 50)
+    near, far = (Motion(time, size * np.cos(6 * time)[:, None], *[0 * time[:, None]] * 2)
+                 for size in (reach, 2.0))  # fmt: skip
+    plant = Rotor(0.02).replace(load_waves=torch.tensor([waves]).double())
+    fits = {"NFCVFM": SimpleNamespace(plant=plant, motions=(near,))}
+    said = [*_farther(fits, Data([Recording(time, far.q, name="t")], [far]))]
+    assert len(said) == named
+    assert all("NFCVFM: " in text and "joint1 of t (-2 to 2 against -1." in text for text in said)
 
 
 def test_direction_without_training_data_is_named():

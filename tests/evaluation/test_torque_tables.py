@@ -1,5 +1,6 @@
 """Tables of friction torque: recovery, intervals, choice by hold-out blocks, files."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -395,6 +396,20 @@ def test_sound_tables_raise_no_warning(seeds: range) -> None:
         for table in (speeds(1, seed=seed).drop(columns="time"), speeds(10, seed=seed)):
             remarks = fit_torque(table, "stribeck", folds=2).table.remarks
             assert not any("offset" in r or "direction" in r or "accel" in r for r in remarks)
+
+
+@pytest.mark.parametrize(("share", "reported"), [(0.6, True), (0.0, False)])
+def test_error_of_the_load_along_a_motion_is_reported(share: float, reported: bool) -> None:
+    time = 5e-3 * np.arange(4000)
+    qd, load = 2.0 * np.sin(3.0 * time) + np.sin(5.0 * time), 1.0 + 0.5 * np.cos(0.7 * time)
+    tau = 0.3 * np.sign(qd) * (1.0 + share * (load - 1.0)) + 0.05 * qd
+    tau += np.random.default_rng(0).normal(0.0, 0.03, len(qd))
+    table = pd.DataFrame({"time": time, "qd": qd, "load": load, "tau": tau})
+    remarks = fit_torque(table, "coulomb-viscous").table.remarks
+    (size,) = [re.match(r"([\d.]+) N m .* follow the load", x) for x in remarks] or [None]
+    assert bool(size) == reported
+    if size:
+        assert float(size[1]) == pytest.approx(0.3 * share * load.std(), rel=0.1)
 
 
 def test_acceleration_phases_are_reported() -> None:

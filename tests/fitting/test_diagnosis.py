@@ -227,6 +227,22 @@ def test_small_motion_near_the_vertical_is_not_at_the_horizontal():
     assert warnings_of(plant, q, torque([1.0], 4)) == ()
 
 
+def test_a_joint_at_rest_names_no_mistake():
+    """Friction holds it, whatever its rig; an encoder that flickers shows no motion."""
+    plant, count = PendulumChain(**MOTOR, position_quantum=COUNT), np.arange(SAMPLES) // 700 % 3
+    assert COUNT is not None
+    said = warnings_of(plant, math.pi + COUNT * count[:, None], None)
+    assert any("2 of its encoder's counts" in text for text in said)
+    assert not any("mistake" in text for text in said)
+
+
+def test_viscous_friction_has_no_sign_to_smooth(monkeypatch):
+    monkeypatch.setattr(inputs, "turning_velocity", lambda *_: (1e-2, 1e-3))
+    recording = swing(pendulum(), NCFM(2, [2e-3]), seconds=0.5)
+    tasks = [prepare_task(x, pendulum(), [recording], FitOptions()) for x in ("NCFM", "CFM")]
+    assert [len(task.smoothed) for task in tasks] == [0, 1]
+
+
 def test_very_short_recording_names_no_mistake():
     """Corrections explain the few torques of a short recording by chance."""
     plant, model = pendulum(), LFM(2, [[2e-3, 3e-3]] * 2)

@@ -267,7 +267,7 @@ def test_inputs_that_leave_only_noise_answer_the_warnings_of_their_law(
     )
     recording = swing(pendulum(), truth(name), seconds=2.0)
     found = fit(NFCVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
-    for warning in (late, drift):
+    for warning in ("Perhaps torques are recorded later, as found with the constant law.", drift):
         assert (warning in found.warnings) == (warning in found.unmodelled) == (not explained)
 
 
@@ -292,6 +292,9 @@ class Contest:
 
     def train(self) -> None:
         self.trained = True
+
+    def explains(self, squares: torch.Tensor) -> bool:
+        return False
 
 
 @pytest.fixture(scope="module")
@@ -341,6 +344,13 @@ def test_inputs_must_improve_the_network_and_not_worsen_its_law(
     assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
     assert found.task.model.inputs == ["direction"]
     assert task.model.inputs is None
+
+
+def test_a_network_that_leaves_only_noise_needs_no_inputs(task, monkeypatch):
+    plain = Contest(task, "law")
+    monkeypatch.setattr(Contest, "explains", lambda self, squares: True)
+    monkeypatch.setattr(neurofuzzy.inputs, "chosen_inputs", None)
+    assert neurofuzzy._with_chosen_inputs(plain) == ((), plain)
 
 
 def test_inputs_that_a_fit_selected_are_selected_again(monkeypatch, tmp_path) -> None:

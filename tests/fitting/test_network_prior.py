@@ -114,6 +114,24 @@ def test_network_worse_than_its_law_on_long_windows_is_rejected(
     assert ("windows of 0.5 s, to which its constant law was fitted" in found.status) is not kept
 
 
+@pytest.mark.usefixtures("sets_stay")
+def test_network_worse_than_its_law_in_training_is_rejected(constant, monkeypatch):
+    """Its last search, with all windows, may end at a worse minimum."""
+    recording, found = constant
+    error, parts = float(found.residuals.square().mean().sqrt()), []
+
+    def rms(test, problem, *_):
+        parts.append(len(test))
+        of_network = isinstance(problem.friction.schedule, NeuroFuzzy)
+        size = 1.25 * error if len(test) > max(parts[:1]) else 0.5 if of_network else 1.0
+        return torch.full((len(test),), size).square()
+
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.settled", rms)
+    settings = {"windows": (0.2,), "fit_plant": False, "max_steps": 2}
+    found = fit(NFLFM(1, v_smooth=V_SMOOTH, **SMALL), one_link(), recording, **settings)
+    assert "over windows of 0.2 s" in found.status
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 def test_nonlinear_law_has_a_network_too(constant):
@@ -314,24 +332,30 @@ def test_sets_adapt_and_evidence_rises_if_even_sets_are_wrong(
 
     def record(self, trial, noise, stride, *, learn_sets):
         adapted.append(adapt(self, trial, noise, stride, learn_sets=learn_sets))
+        learning.append(learn_sets)
         return adapted[-1]
 
-    def once(self, trial):
-        trials.append(trained_on(self, trial) if not trials else trial)
+    def twice(self, trial):
+        if len(trials) < 2:
+            trials.append(trained_on(self, trial))
         return trials[-1]
 
+    learning: list[bool] = []
     adapt, trained_on = Validation._adapted, Validation.trained_on
     monkeypatch.setattr(Validation, "_adapted", record)
-    monkeypatch.setattr(Validation, "trained_on", once)
+    monkeypatch.setattr(Validation, "trained_on", twice)
     model, even = (NFNCFM(1, terms=(3, 1), head_units=1) for _ in range(2))
     found = fit(model, ARM, recording, windows=(0.5,), fit_plant=False, drag=False)
-    held, moved = adapted
+    held, moved, _ = adapted
+    # Sets that have moved stay unknown.
+    assert learning == [False, True, True]
     assert moved.end.problem.noise_sd == held.end.problem.noise_sd
     assert log_evidence(moved.end) > log_evidence(held.end) + 1
     assert moved.end.rms < 0.8 * held.end.rms
     pairs = zip(*(m.schedule.network.anfis.sets() for m in (model, even)), strict=True)
     assert min((new - old)[0, :3].abs().max() for new, old in pairs) > 0.05
     assert "sets moved" in found.status
+    assert [residual for _, residual in found.stages] == [found.residual]
     gamma = found.to_dict()["effective_parameters"]
     assert set(gamma) >= {"set centres", "set widths", "head centres", "head widths"}
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)

@@ -254,6 +254,7 @@ def test_names_are_case_insensitive() -> None:
         for text in (name, plain_name(name)):
             forms = (text.upper(), text.lower(), text.title(), f" {text} ", text.replace("-", "_"))
             assert {model_name(form) for form in forms} == {name}
+    assert model_name("Neuro-fuzzy:LFM") == "NFLFM"
 
 
 def test_arrays_and_lists_are_accepted_as_inputs() -> None:

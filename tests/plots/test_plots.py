@@ -237,6 +237,20 @@ def test_torque_points_lie_on_the_true_law():
     assert_tidy(figure)
 
 
+def test_friction_that_follows_a_load_is_drawn_at_its_median():
+    law = LFM(1, [3.0, 5.0])
+    plant, recording, motion = axis_data(law)
+    placed = plant.replace(load_waves=torch.tensor([2.0]).double())
+    figure = plots.torque_over_velocity(
+        plant, {"LFM": law}, [recording], [motion], plants={"LFM": placed}
+    )
+    x, y = figure.axes[0].lines[-1].get_data()
+    fast = torch.as_tensor(x[-1:])[:, None]
+    load = np.median(0.5 + 0.5 * np.cos(2.0 * motion.q))
+    expected = law(fast, 0 * fast, torch.full_like(fast, load))
+    assert y[-1] == pytest.approx(float(expected.detach()), rel=1e-6)
+
+
 def test_medians_show_the_friction_despite_noise():
     law = CVFM(1, [3.0, 5.0])
     plant, recording, motion = axis_data(law)

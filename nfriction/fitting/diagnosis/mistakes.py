@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from nfriction.fitting.adjusted_plant import adjusted_plant
-from nfriction.fitting.data.inputs import names_of, weighs
+from nfriction.fitting.data.inputs import names_of, ranges, weighs
 from nfriction.fitting.diagnosis import corrections
 from nfriction.fitting.diagnosis.balance import (
     FEWEST_BLOCKS,
@@ -72,7 +72,10 @@ def likely_mistakes(
     # These spoil the balance, and a fit absorbs some wrong times in the inertia.
     if broken := next(_broken_rows(recordings, options), None):
         return math.nan, (broken,)
-    if len(given.q) < FEWEST_BLOCKS * given.block:
+    counts = plant.position_quantum or np.fmin.reduce([count_seen(r.q) for r in recordings])
+    still = ranges(recordings) <= options.min_counts * np.nan_to_num(counts)
+    # Dry friction holds a joint that hardly moves, whatever its rig.
+    if still.all() or len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = unexplained_share(plant, given)
     noise = noise_share(plant, given, given.sd_of_mean)

@@ -49,7 +49,7 @@ class InputGain:
     def words(self, joint_names: Sequence[str]) -> str:
         """A sentence about the input."""
         alone = ", ".join(
-            f"{joint} {100 * share:.0f} %"
+            f"{joint} {round(100 * share)} %"
             for joint, share in zip(joint_names, self.by_joint, strict=True)
         )
         each = f" (with one joint alone: {alone})" if len(joint_names) > 1 else ""
@@ -94,7 +94,7 @@ class FitResult:
         noise: root mean square residual that a correct law would have from the noise of encoders
             and torque [rad; m]; None after an equation-error fit.
         stages: window length of each stage that was kept [s], and its residual in
-            `residual_unit`; for constant coefficients.
+            `residual_unit`; without those of its constant law for a network.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
         outliers: consecutive samples to which a robust loss gives less than half weight.
         effective_parameters: for a network: name of each group of its parameters, how many of them

@@ -163,6 +163,7 @@ def result_from_shooting(
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         noise=noise,
+        stages=((problem.windows.length, residual),),
         mistakes=mistakes,
         unmodelled=scaled * far + tuple(text for text, wrong in gains if wrong),
         warnings=tuple(f"A mistake in data or rig is likely: {text}." for text in mistakes)

@@ -71,8 +71,13 @@ def verdict(network: Tensor, law: Tensor, blocks: str = "windows", least: float 
     if math.isinf(change):
         return f"Network rejected: it diverges on hold-out {blocks}; its constant law is kept."
     better, tied = int((network < law).sum()), int((network == law).sum())
+    if tied == len(law):  # errors count as no smaller than the noise
+        return (
+            f"Network rejected: its constant law already explains the hold-out {blocks} to the "
+            "noise; the constant law is kept."
+        )
     ties = f" (equal on {tied})" if tied else ""
-    if 2 * tied > len(law):  # errors count as no smaller than the noise
+    if 2 * tied > len(law):
         ties = f" and equal on {tied}, most of which the law already explains to the noise"
     gain = f" ({100 * (least - 1):.0f} % and more than the scatter are required)"
     return (

@@ -146,6 +146,16 @@ def with_position_load(task: FitTask, start: FitResult, rates: Tensor | None = N
     return at(rates[best], torch.atan2(-sine, cosine))
 
 
+def known_positions(plant: Plant, motions: Sequence[Motion]) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the positions at which friction by position is known, (joint,) each [rad; m].
+
+    Infinite where motions cover a whole period of it, and where friction has no waves.
+    """
+    q, waves = np.concatenate([m.q for m in motions]), plant.load_waves.numpy()
+    whole = (waves * np.ptp(q, axis=0) >= 2 * math.pi) | (waves == 0)
+    return np.where(whole, -np.inf, q.min(axis=0)), np.where(whole, np.inf, q.max(axis=0))
+
+
 def longest_duration(motions: Sequence[Motion]) -> float:
     """Duration of the longest motion [s]."""
     return max(float(motion.time[-1] - motion.time[0]) for motion in motions)

@@ -46,7 +46,6 @@ from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
-from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -100,7 +99,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     # Only what the constant fit shows: a network's parameters have no intervals.
     shown = {k: inputs.significant(contest.start, k) for k in INPUTS if has_input(model.law, k)}
     if shown.get("position"):
-        said.append(_ripple(found.plant, shown["position"]))
+        said.append(_ripple(found, sorted(shown["position"])))
     if shown.get("heat"):
         cooling_time = cast("Heated", model.schedule).cooling_time
         slow = cooling_time > inputs.longest_duration(motions)
@@ -110,7 +109,13 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     richer = contest.accepted or contest.start is not start
     if richer and task.leaves_noise(found):
         return found  # without what the fit of the law alone warned of, such as a delay
-    return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
+    of_law, unmodelled = start.data_warnings, start.unmodelled
+    if richer:
+        of_law, unmodelled = (
+            tuple(f"{x.rstrip('.')}, as found with the constant law." for x in texts)
+            for texts in (of_law, unmodelled)
+        )
+    return found.with_warnings(of_law, unmodelled=unmodelled)
 
 
 def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
@@ -120,20 +125,29 @@ def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
     return copied
 
 
-def _ripple(plant: Plant, joints: set[int]) -> str:
-    """A sentence about the positions where friction of these joints is largest."""
+def _ripple(found: FitResult, joints: Sequence[int]) -> str:
+    """Sentences on where friction of these joints is largest, and where it is known."""
+    plant, (low, high) = found.plant, inputs.known_positions(found.plant, found.motions)
     rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
-    peaks, unit = (rows[j] for j in sorted(joints)), plant.unit
+    peaks, unit = (rows[j] for j in joints), plant.unit
     at = ", ".join(
         f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {unit} ({n})" for n, p, k in peaks
     )
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
-    return f"Friction by position is largest at{angles} {at}, as long as encoders keep their zeros."
+    known = "".join(
+        f" That of {plant.joint_names[j]} is known from {low[j]:.3g} to {high[j]:.3g} {unit} only."
+        for j in joints
+        if math.isfinite(low[j])
+    )
+    zeros = "as long as encoders keep their zeros"
+    return f"Friction by position is largest at{angles} {at}, {zeros}.{known}"
 
 
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[inputs.InputGain, ...], "_Contest"]:
-    """Inputs that improve the network on hold-out windows (or none), and their contest."""
+    """Inputs that improve the network on hold-out windows, if it needs any, and their contest."""
     task = plain.task
+    if plain.accepted and plain.validation.explains(plain.squares):
+        return (), plain
     chosen, start, seeing = inputs.chosen_inputs(task, plain.start)
     if not chosen:
         return (), plain
@@ -241,7 +255,10 @@ class _Contest:
         if self.rejected or end is None or best is None:
             revert_to_constant(self.network, self.start, self.task.options)
             model.load_state_dict(self.network.state_dict())
-            return constant_kept(self.start, model, self.rejected, converged=not self.stopped)
+            seen = ", ".join(cast("NeuroFuzzyModel", self.task.model).inputs or ())
+            law = f"constant law with the input {seen}" if seen else "constant law"
+            note = self.rejected.replace("constant law is kept", f"{law} is kept")
+            return constant_kept(self.start, model, note, converged=not self.stopped)
         found = copy.deepcopy(end.problem.friction)
         result = result_from_shooting(found, end.problem, end.result, self.task.motions)
         model.load_state_dict(found.state_dict())
@@ -448,6 +465,10 @@ class Validation:
         """True if whole recordings can be held out."""
         return len({place for place, *_ in self.smoothed.spans}) > 1
 
+    def explains(self, squares: Tensor) -> bool:
+        """True if squared errors of most windows, (window,), are no larger than the noise."""
+        return bool(squares.median() <= self.explained**2)
+
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The trial with the best prior; a wider plant prior is used only if clearly better."""
         assert len(self.of_law)  # the law first: a network is judged relative to it
@@ -477,15 +498,18 @@ class Validation:
         """
         residuals, used = trial.end.residuals, trial.end.problem.noise_sd
         noise = max(min(effective_noise(residuals), self.noise), self.options.min_noise)
-        explained = trial.squares.median() <= self.explained**2
+        explained = self.explains(trial.squares)
         if explained and self.options.explained_ratio * noise >= used:
             return trial
         # If correlations are shorter than the law's, more samples are used.
         stride = min(decimation(residuals, self.options), trial.end.problem.stride)
-        held = self._adapted(trial, noise, stride, learn_sets=False)
-        moved = self._adapted(held, noise, stride, learn_sets=True)
-        gained = log_evidence(moved.end) - log_evidence(held.end)
-        better = moved if gained > self.options.evidence_gain else held
+        # Sets that the data have moved stay unknown, so that the error bars include theirs.
+        learnt = cast("NeuroFuzzy", trial.end.problem.friction.schedule).learn_sets
+        better = self._adapted(trial, noise, stride, learn_sets=learnt)
+        if not learnt:
+            moved = self._adapted(better, noise, stride, learn_sets=True)
+            gained = log_evidence(moved.end) - log_evidence(better.end)
+            better = moved if gained > self.options.evidence_gain else better
         judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
         # The gain need not exceed its scatter: the last rounds of training each gain little.
         if mean_gain(judged.squares, trial.squares)[0] > 0:
@@ -541,12 +565,13 @@ class Validation:
     def lost_over_long_windows(self, end: HorizonResult) -> str:
         """Reason to reject a network that is worse than its law over the law's windows, or "".
 
-        Hold-out windows are shorter, and insensitive to small torque errors.
+        Hold-out windows may be shorter, and insensitive to small torque errors; and the last search
+        may end at a worse minimum.
         """
         # From the states of the network's own fit: smoothed ones may lead to another minimum.
         simulated = end.problem.simulated_motions(end.result.x, self.motions)
         windows = self.law.cut(simulated, self.length, self.motions)
-        if end.stopped or windows.spans == self.windows.spans:
+        if end.stopped:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
         of_law = self.of_start.square()
