@@ -462,7 +462,8 @@ def _of_load(joint: JointTorque, error: Array) -> float:
     if joint.load is None:
         return 0.0
     sign, speed = np.sign(joint.qd), np.abs(joint.qd)
-    odd = sign[:, None] * np.stack([speed**0, speed, np.sqrt(speed)], 1)
+    # A load that grows with the speed, as by centrifugal force, is no cause.
+    odd = sign[:, None] * np.stack([speed**0, speed, np.sqrt(speed), speed**2], 1)
     given = np.stack([error, sign * joint.load], 1)
     error, cause = (given - odd @ np.linalg.lstsq(odd, given, None)[0]).T
     parts = blocks(joint, min(FOLDS, len(joint)))

@@ -168,8 +168,9 @@ def prepare_task(
 
 def _has_sign(law: Law) -> bool:
     """True if the friction is smoothed around zero velocity."""
-    ones = torch.ones(1, len(law.names), dtype=torch.float64)
-    steep, smooth = (law.torque(ones[:, 0], ones[:, 0], ones, v_smooth) for v_smooth in (1.0, 2.0))
+    coefficients = torch.arange(1.0, 1 + len(law.names), dtype=torch.float64)[None]
+    slow, load = (x * torch.ones(1, dtype=torch.float64) for x in (0.1, 1.0))
+    steep, smooth = (law.torque(slow, load, coefficients, v_smooth) for v_smooth in (1.0, 2.0))
     return not torch.equal(steep, smooth)
 
 

@@ -86,7 +86,8 @@ def torque_over_velocity(
             ax.plot(grid, factor * line, **looks[name].line)
             if name in known:
                 at = torch.as_tensor(grid)[:, None].expand(-1, plant.joints).contiguous()
-                sd = known[name].torque_sd(models[name], at)[:, k].numpy()
+                load = load_at_rest(models[name].law, at) * loads[name]
+                sd = known[name].torque_sd(models[name], at, load)[:, k].numpy()
                 _band(ax, grid, factor * line, factor * sd, looks[name].line["color"])
         ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
         _name_axes(ax, plant.joint_names[k], plant.unit, unit)

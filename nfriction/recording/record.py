@@ -319,7 +319,12 @@ class Recording:
                 warnings.filterwarnings("ignore", ".*looks like degrees", RecordingWarning)
             convention = None if convention is None else AngleConvention.of(convention)
             label = tuple(filter(None, names))
-            recording = cls(**arrays, names=label, convention=convention, unit=unit, name=name)
+            try:
+                recording = cls(**arrays, names=label, convention=convention, unit=unit, name=name)
+            except ValueError as error:
+                lacking = len(table) - len(arrays["time"])
+                before = f" {lacking} rows without a number were left out before." * bool(lacking)
+                raise ValueError(f"{error}{before}") from error
         for finding, remedy in remarks:
             recording._warn(finding, remedy, stacklevel=3)
         return recording

@@ -160,14 +160,14 @@ def test_test_recording_faster_than_all_training_data_is_named(recwarn):
         compare(pendulum(), "NCFM", B, A, **settings)
 
 
-@pytest.mark.parametrize(("waves", "reach", "named"), [(2, 1.4, 1), (2, 1.6, 0), (0, 1.0, 0)])
+@pytest.mark.parametrize(("waves", "reach", "named"), [(2, 1.2, 1), (2, 1.6, 0), (0, 1.0, 0)])
 def test_positions_without_training_data_are_named(waves, reach, named):
     """Unless training covers a whole period of the friction by position, or there is none."""
     time = np.linspace(0.0, 1.0, 50)
     near, far = (Motion(time, size * np.cos(6 * time)[:, None], *[0 * time[:, None]] * 2)
                  for size in (reach, 2.0))  # fmt: skip
     plant = Rotor(0.02).replace(load_waves=torch.tensor([waves]).double())
-    fits = {"NFCVFM": SimpleNamespace(plant=plant, motions=(near,))}
+    fits = {"NFCVFM": SimpleNamespace(plant=plant, motions=(near,), encoder_offsets=())}
     said = [*_farther(fits, Data([Recording(time, far.q, name="t")], [far]))]
     assert len(said) == named
     assert all("NFCVFM: " in text and "joint1 of t (-2 to 2 against -1." in text for text in said)

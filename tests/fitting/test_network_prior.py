@@ -373,11 +373,9 @@ def test_training_goes_on_for_gains_below_their_scatter(
 
     def scattered(self, trial):
         found = judged(self, trial)
-        if not rounds:
-            return found
-        # Without a mean gain but for the factor.
-        spread = torch.where(torch.arange(len(found.squares)) % 2 > 0, 2.0, 0.5)
-        return replace(found, squares=factor * spread * rounds[0].squares)
+        even = torch.full_like(found.squares, 1e-6)
+        spread = torch.where(torch.arange(len(even)) % 2 > 0, 1.5, 0.5)
+        return replace(found, squares=factor * spread * even if rounds else even)
 
     monkeypatch.setattr(Validation, "_adapted", further)
     monkeypatch.setattr(Validation, "judged", scattered)

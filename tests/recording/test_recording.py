@@ -848,9 +848,20 @@ def test_rows_without_a_number_are_left_out_with_a_warning() -> None:
     assert np.array_equal(read.tau[:, 0], kept["cur"])
 
 
+def test_rows_left_out_are_named_in_later_errors() -> None:
+    table = pd.DataFrame({"time": np.arange(60.0), "q1": 0.0, "qd2": np.nan, "q2": 0.0})
+    table.loc[:9, "q2"] = np.nan
+    table.loc[30, "q1"] = np.inf
+    with pytest.raises(ValueError, match=r"inf at sample 20 .* 10 rows without a number were left"):
+        Recording.from_pandas(table)
+    table.loc[30, "q1"] = 0.0
+    with pytest.warns(RecordingWarning, match=r"10 of 60 rows .* have no number in q2, so"):
+        Recording.from_pandas(table)
+
+
 def test_columns_of_different_rates_are_refused() -> None:
     time = 1e-3 * np.arange(100)
     table = pd.DataFrame({"time": time, "q1": time})
     table.loc[np.arange(100) % 3 > 0, "q1"] = np.nan
-    with pytest.raises(ValueError, match=r"66 of 100 rows .* in q1; log all columns at one rate"):
+    with pytest.raises(ValueError, match=r"66 of 100 rows .* in q1; drop empty columns"):
         Recording.from_pandas(table)

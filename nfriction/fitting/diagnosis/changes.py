@@ -220,7 +220,7 @@ class _Change(NamedTuple):
             cause = "sensor, amplifier"
             sizes = abs(self.rate) * self.size, sure * self.sd * self.size
         else:
-            what, cause, unit = "friction", "warm-up, payload, position", " %"
+            what, cause, unit = "friction", "warm-up, payload or position", " %"
             sizes = 100 * abs(last / first - 1), 100 * sure * self.sd * slope
             if self.of == "scale":
                 what, cause = f"scale of the {plant.effort}", "torque constant, sensor, supply"

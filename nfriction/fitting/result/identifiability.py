@@ -263,13 +263,13 @@ class CoefficientUncertainty:
         found = torch.cat([self._sd(v, a) for v, a in zip(*flat, strict=True)])
         return found.reshape(*shape, -1)
 
-    def torque_sd(self, model: FrictionModel, qd: Tensor) -> Tensor:
+    def torque_sd(self, model: FrictionModel, qd: Tensor, load: Tensor | None = None) -> Tensor:
         """Standard deviation of a model's torque at velocities, (sample, joint).
 
-        At the load at rest and without acceleration. `model` has this schedule; its `v_smooth` is
-        assumed to be known.
+        At a load shaped like `qd`, by default that at rest, and without acceleration. `model` has
+        this schedule; its `v_smooth` is assumed to be known.
         """
-        rest, load = torch.zeros_like(qd), load_at_rest(model.law, qd)
+        rest, load = torch.zeros_like(qd), load_at_rest(model.law, qd) if load is None else load
         with torch.enable_grad():
             held = model.coefficients(qd, rest).detach().expand(*qd.shape, -1).clone()
             held.requires_grad_()

@@ -43,6 +43,8 @@ from nfriction.signals import Motion
 SLOW_COOLING = 30.0
 # Waves of friction over the position, per turn or per stroke of an axis.
 WAVES = (1, 2, 3, 4)
+# Pieces of a wave; within one it changes by at most an eighth of its height.
+PHASES = 24
 # Alternatives among which an input is chosen for each joint: waves, and a quarter of a turn for the
 # phase. The choice costs the logarithm of their number in evidence.
 ALTERNATIVES = {"position": 4 * len(WAVES)}
@@ -146,14 +148,17 @@ def with_position_load(task: FitTask, start: FitResult, rates: Tensor | None = N
     return at(rates[best], torch.atan2(-sine, cosine))
 
 
-def known_positions(plant: Plant, motions: Sequence[Motion]) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the positions at which friction by position is known, (joint,) each [rad; m].
+def phase_bins(plant: Plant, q: np.ndarray) -> np.ndarray:
+    """Piece of a wave of the friction by position at positions, (sample, joint)."""
+    turns = (plant.load_waves.numpy() * q / (2 * math.pi)) % 1.0
+    return np.minimum(PHASES * turns, PHASES - 1).astype(int)
 
-    Infinite where motions cover a whole period of it, and where friction has no waves.
-    """
-    q, waves = np.concatenate([m.q for m in motions]), plant.load_waves.numpy()
-    whole = (waves * np.ptp(q, axis=0) >= 2 * math.pi) | (waves == 0)
-    return np.where(whole, -np.inf, q.min(axis=0)), np.where(whole, np.inf, q.max(axis=0))
+
+def known_phases(plant: Plant, motions: Sequence[Motion]) -> np.ndarray:
+    """True for pieces of a wave that motions visit, (joint, piece); all where there is no wave."""
+    bins = phase_bins(plant, np.concatenate([m.q for m in motions]))
+    pieces = [np.isin(np.arange(PHASES), bins[:, j]) for j in range(plant.joints)]
+    return np.array(pieces) | (plant.load_waves.numpy() == 0)[:, None]
 
 
 def longest_duration(motions: Sequence[Motion]) -> float:

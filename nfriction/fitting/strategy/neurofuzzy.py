@@ -26,7 +26,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import improves, mean_gain
+from nfriction.fitting.result.paired_test import improves
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -46,6 +46,7 @@ from nfriction.friction.inputs import INPUTS, has_input
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.group_evidence import GroupEvidence, group_evidence
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -99,7 +100,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     # Only what the constant fit shows: a network's parameters have no intervals.
     shown = {k: inputs.significant(contest.start, k) for k in INPUTS if has_input(model.law, k)}
     if shown.get("position"):
-        said.append(_ripple(found, sorted(shown["position"])))
+        said.append(_ripple(found.plant, sorted(shown["position"]), contest.task.motions))
     if shown.get("heat"):
         cooling_time = cast("Heated", model.schedule).cooling_time
         slow = cooling_time > inputs.longest_duration(motions)
@@ -109,13 +110,13 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     richer = contest.accepted or contest.start is not start
     if richer and task.leaves_noise(found):
         return found  # without what the fit of the law alone warned of, such as a delay
-    of_law, unmodelled = start.data_warnings, start.unmodelled
-    if richer:
-        of_law, unmodelled = (
-            tuple(f"{x.rstrip('.')}, as found with the constant law." for x in texts)
-            for texts in (of_law, unmodelled)
-        )
-    return found.with_warnings(of_law, unmodelled=unmodelled)
+    of_task = (*task.data_warnings, *task.smoothed)
+
+    def kept(texts: Sequence[str]) -> list[str]:
+        of_law = ".", ", as found with the constant law."
+        return [x if x in of_task or not richer else x.removesuffix(".") + of_law[1] for x in texts]
+
+    return found.with_warnings(kept(start.data_warnings), unmodelled=kept(start.unmodelled))
 
 
 def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
@@ -125,19 +126,21 @@ def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
     return copied
 
 
-def _ripple(found: FitResult, joints: Sequence[int]) -> str:
+def _ripple(plant: Plant, joints: Sequence[int], motions: Sequence[Motion]) -> str:
     """Sentences on where friction of these joints is largest, and where it is known."""
-    plant, (low, high) = found.plant, inputs.known_positions(found.plant, found.motions)
     rows = [*zip(plant.joint_names, plant.load_phase, plant.load_waves, strict=True)]
     peaks, unit = (rows[j] for j in joints), plant.unit
     at = ", ".join(
         f"{-p / k:.3g} and every {2 * math.pi / k:.3g} {unit} ({n})" for n, p, k in peaks
     )
     angles = " joint angles (relative, from upright) of" if plant.unit == "rad" else ""
+    q = np.concatenate([m.q for m in motions])
+    phases = inputs.known_phases(plant, motions)
     known = "".join(
-        f" That of {plant.joint_names[j]} is known from {low[j]:.3g} to {high[j]:.3g} {unit} only."
+        f" That of {plant.joint_names[j]} is known only at the recorded positions, from "
+        f"{q[:, j].min():.3g} to {q[:, j].max():.3g} {unit}."
         for j in joints
-        if math.isfinite(low[j])
+        if not phases[j].all()
     )
     zeros = "as long as encoders keep their zeros"
     return f"Friction by position is largest at{angles} {at}, {zeros}.{known}"
@@ -255,8 +258,8 @@ class _Contest:
         if self.rejected or end is None or best is None:
             revert_to_constant(self.network, self.start, self.task.options)
             model.load_state_dict(self.network.state_dict())
-            seen = ", ".join(cast("NeuroFuzzyModel", self.task.model).inputs or ())
-            law = f"constant law with the input {seen}" if seen else "constant law"
+            seen = cast("NeuroFuzzyModel", self.task.model).inputs or ()
+            law = f"constant law with {' and '.join(seen)}" if seen else "constant law"
             note = self.rejected.replace("constant law is kept", f"{law} is kept")
             return constant_kept(self.start, model, note, converged=not self.stopped)
         found = copy.deepcopy(end.problem.friction)
@@ -467,7 +470,7 @@ class Validation:
 
     def explains(self, squares: Tensor) -> bool:
         """True if squared errors of most windows, (window,), are no larger than the noise."""
-        return bool(squares.median() <= self.explained**2)
+        return bool((squares <= self.explained**2).double().mean() > 0.5)
 
     def best_trial(self, fitters: Sequence[ShootingFitter]) -> Trial:
         """The trial with the best prior; a wider plant prior is used only if clearly better."""
@@ -490,7 +493,7 @@ class Validation:
         return best
 
     def trained_on(self, trial: Trial) -> Trial:
-        """A trial trained further at its residual noise, or unchanged if that gains too little.
+        """A trial trained further at its residual noise, or unchanged if that gains nothing.
 
         With the law's error as noise, sets could hardly move. They move if the evidence favours it.
         Windows explained by measurement noise cannot discriminate; then training continues as long
@@ -512,7 +515,7 @@ class Validation:
             better = moved if gained > self.options.evidence_gain else better
         judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
         # The gain need not exceed its scatter: the last rounds of training each gain little.
-        if mean_gain(judged.squares, trial.squares)[0] > 0:
+        if improves(judged.squares, trial.squares, chance=0.5):
             return judged
         return judged if explained and not improves(trial.squares, judged.squares) else trial
 
@@ -574,10 +577,11 @@ class Validation:
         if end.stopped:
             return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
-        of_law = self.of_start.square()
+        loss = end.problem.loss
+        of_law = loss.counted(self.of_start).square()
         # The law may have been fitted to windows of other lengths.
         if of_law.shape != windows.q.shape:
-            problem = self.law.problem(windows, self.noise, law)
+            problem = replace(self.law.problem(windows, self.noise, law), loss=loss)
             of_law = holdout.settled(windows, problem, law, self.plant)
         network = holdout.settled(windows, end.problem, friction, plant)
         worse = 100 * (float((network.mean() / of_law.mean()).sqrt()) - 1)

@@ -134,7 +134,8 @@ def table_arrays(
     remarks = [*undecided, *_remarks(table, sources, joints)]
     complete = np.all([~np.isnan(np.c_[x]).any(axis=1) for x in arrays.values()], axis=0)
     if not complete.all():
-        remarks.append(_incomplete_rows(table, sources, complete))
+        read = {k: v for k, v in sources.items() if k.rstrip("0123456789") in arrays}
+        remarks.append(_incomplete_rows(table, read, complete))
         arrays = {key: values[complete] for key, values in arrays.items()}
     of_motors = any(source.motor == "motor" for source in sources.values())
     has_unit = degrees or all(source.unit for source in positions)
@@ -154,7 +155,8 @@ def _incomplete_rows(
     )
     if 2 * complete.sum() < len(complete):
         raise ValueError(
-            f"{finding}; log all columns at one rate, or interpolate them to common time stamps."
+            f"{finding}; drop empty columns, and log the others at one rate or interpolate them to "
+            "common time stamps."
         )
     return f"{finding}, so they are left out", "fill them if these columns are sampled less often"
 
