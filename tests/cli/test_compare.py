@@ -137,6 +137,7 @@ def test_initial_states_are_used_and_missing_ones_named(
     assert off["test"]["b"]["free_run"]["all"] > 0.03
 
 
+@pytest.mark.slow
 def test_no_fit_plant_keeps_the_plant_and_drag_adds_terms(bench: Path) -> None:
     terms = []
     for k, option in enumerate((["--no-fit-plant"], [], ["--drag"])):

@@ -112,6 +112,7 @@ def test_parameter_determined_in_few_sessions_has_no_interval():
     assert (found.next_low, found.next_high) == (-math.inf, math.inf)
 
 
+@pytest.mark.slow
 def test_fixed_coefficients_are_kept_in_the_mean_model():
     rng, sessions = np.random.default_rng(0), {}
     for k in range(3):

@@ -166,6 +166,7 @@ def test_peak_below_the_slowest_velocity_is_bounded_by_the_friction() -> None:
         assert coulomb + peak < 2.2
 
 
+@pytest.mark.slow
 def test_every_file_of_a_run_gives_the_predictions_of_the_fit(tmp_path: Path) -> None:
     table = two_joints()
     models = "coulomb-viscous,load-coulomb,stribeck,neuro-fuzzy:coulomb"
@@ -437,10 +438,8 @@ def test_rejected_network_is_not_chosen_over_its_law() -> None:
     assert _choose([law, network])[1].endswith("with no more parameters")
 
 
-@pytest.mark.parametrize(
-    "speeds",
-    [(0.5, 1.0, 2.0, 4.0), pytest.param((0.1, 0.3, 0.6, 1.0, 2.0, 4.0), marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("speeds", [(0.5, 1.0, 2.0, 4.0), (0.1, 0.3, 0.6, 1.0, 2.0, 4.0)])
 def test_noise_in_repeated_rows_does_not_select_a_larger_law(speeds: tuple[float, ...]) -> None:
     """A few speeds do not show the shape of a curve, however often each is repeated."""
     rng = np.random.default_rng(5)

@@ -40,6 +40,7 @@ def test_heat_in_c_equals_the_models_and_is_zero_after_a_reset(tmp_path: Path) -
     assert heat[-1].min() > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_c_in_single_precision_keeps_small_heat_increments(tmp_path: Path) -> None:
     model = copy.deepcopy(MODEL)

@@ -107,6 +107,7 @@ def test_early_torques_are_doubtful_beside_a_residual():
     assert wrong.usability[0] != "good"
 
 
+@pytest.mark.slow
 def test_scores_use_the_fitted_delay():
     train, test = delayed("one"), delayed("two", 2.0)
     test = test._replace(q=-test.q, tau=-test.tau)  # the other way, or a fit would have seen it
@@ -177,14 +178,11 @@ def test_half_a_sample_of_delay_is_reported():
     assert not any("delay" in text for text in held.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("motion", "verdict"),
     # The last case needs more integration steps at the start of the search than at its end.
-    [
-        ((3, 0.1, 0.003), "doubtful"),
-        pytest.param((1, 0.1, 0.003), "good", marks=pytest.mark.slow),
-        pytest.param((0, 0.45, 0.05), "doubtful", marks=pytest.mark.slow),
-    ],
+    [((3, 0.1, 0.003), "doubtful"), ((1, 0.1, 0.003), "good"), ((0, 0.45, 0.05), "doubtful")],
 )
 def test_fit_is_doubtful_if_the_delay_moves_coefficients_significantly(motion, verdict):
     recording, truth = driven_pendulum(*motion), np.ravel(DRY)

@@ -563,7 +563,7 @@ def test_mistakes_in_rigs_are_named(name, rig, finding):
 GUESSED = {"mass": [0.2, 0.2], "length": [0.2, 0.25]}
 
 
-@pytest.mark.parametrize(("mass", "length"), [([0.2, 0.2], 0.2), ([0.5, 0.1], 0.3)])
+@pytest.mark.parametrize(("mass", "length"), [slow([0.2, 0.2], 0.2), ([0.5, 0.1], 0.3)])
 def test_free_rig_with_guessed_masses_and_lengths_is_corrected(mass, length):
     true, q, _ = measured("free")
     guessed = PendulumChain(mass=mass, length=[length, 0.25])

@@ -135,6 +135,7 @@ def test_encoders_may_be_zeroed_at_the_start_of_each_recording():
     assert torch.equal(each.plant.angle_offset, plant.angle_offset)
 
 
+@pytest.mark.slow
 def test_hold_out_block_has_the_encoder_offset_of_its_recording():
     """The encoder offsets follow from the last and the first third of a recording."""
     plant = geared()
@@ -273,7 +274,8 @@ def fitted_offset(plant, truth, recording, share):
     return model.schedule.values[:, 0]
 
 
-@pytest.mark.parametrize("bare", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("bare", [True, False])
 def test_missing_rotor_inertia_is_named_if_it_biases_other_terms(bare):
     truth = geared().replace(armature=torch.tensor([0.03, 0.03], dtype=F64))
     given = geared().replace(armature=(0.0 if bare else 0.9) * truth.armature)

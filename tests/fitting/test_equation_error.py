@@ -177,6 +177,7 @@ def test_regression_names_terms_that_are_zero():
     assert any("smoothed motion" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 def test_fixed_coefficients_keep_the_values_of_the_model():
     """A linear one of a user-defined law, and the exponent of Stribeck friction."""
 

@@ -217,6 +217,7 @@ def test_heat_and_position_are_described_only_where_they_are_significant(where, 
     assert "(joint2)" not in status
 
 
+@pytest.mark.slow
 def test_an_accepted_network_has_the_interval_of_the_fall_by_heat(monkeypatch) -> None:
     monkeypatch.setattr(neurofuzzy, "improves", lambda *_, **__: True)
     monkeypatch.setattr(neurofuzzy.Validation, "trained_on", lambda self, trial: trial)

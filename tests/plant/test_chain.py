@@ -176,7 +176,7 @@ def test_decay_rates_depend_on_the_values_of_the_plant() -> None:
     assert rig.decay_rate(ones * torch.inf).isinf()
 
 
-@pytest.mark.parametrize("arm", ARMS)
+@pytest.mark.parametrize("arm", [ARMS[0], pytest.param(ARMS[1], marks=pytest.mark.slow)])
 def test_forward_and_reverse_gradients_agree(arm: Any) -> None:
     rig = with_encoders(every_kind(arm))
     names = ["inertia_coupling", "gravity_moment", "armature", "angle_offset", "torque_offset"]

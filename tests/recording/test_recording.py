@@ -683,6 +683,7 @@ def test_real_files_read_silently_and_degrees_raise_a_warning(data_dir: Path) ->
                 Recording(recording.time, np.rad2deg(recording.q))
 
 
+@pytest.mark.slow
 def test_initial_states_of_the_real_sets_match_the_recordings(data_dir: Path) -> None:
     multiarm = read_initial_states(data_dir / "multiarm_pendulum" / "recordings.csv")
     assert {key: len(q0) for key, (q0, _) in multiarm.items() if key.endswith("b0")} == {

@@ -54,6 +54,7 @@ def case():
     return plant, train, held, motions, constant
 
 
+@pytest.mark.slow
 def test_terms_are_relative_to_the_rig_as_given_though_it_is_corrected():
     recording = swing(pendulum(), true_model(), seconds=4.0, start=(2.6, 0.2))
     guessed = pendulum().replace(
@@ -102,6 +103,7 @@ def test_coefficients_by_class_are_recovered(case):
         assert mine < other
 
 
+@pytest.mark.slow
 def test_default_fit_finds_the_classes(case):
     plant, train, _, motions, constant = case
     model = ALFM(2, v_smooth=V_SMOOTH)
@@ -151,6 +153,7 @@ def test_stopped_fit_keeps_the_constant_law(case):
     assert "Stopped before the classes were found" in found.status
 
 
+@pytest.mark.slow
 def test_a_stop_after_evidence_accepted_the_classes_keeps_them(case, monkeypatch):
     searches, original = [], ClassFitter.likeliest
 
