@@ -361,7 +361,7 @@ def test_sets_adapt_and_evidence_rises_if_even_sets_are_wrong(
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)
 
 
-@pytest.mark.parametrize(("factor", "goes_on"), [(0.98, True), (1.02, False)])
+@pytest.mark.parametrize(("factor", "goes_on"), [(0.98, True), (1.02, False), (math.inf, False)])
 def test_training_goes_on_for_gains_below_their_scatter(
     where_even_sets_are_wrong, monkeypatch, factor, goes_on
 ):
@@ -374,8 +374,11 @@ def test_training_goes_on_for_gains_below_their_scatter(
     def scattered(self, trial):
         found = judged(self, trial)
         even = torch.full_like(found.squares, 1e-6)
-        spread = torch.where(torch.arange(len(even)) % 2 > 0, 1.5, 0.5)
-        return replace(found, squares=factor * spread * even if rounds else even)
+        # Without a mean gain but for the factor of all, or of the first.
+        spread = torch.where(torch.arange(len(even)) % 2 > 0, 2.0, 0.5)
+        spread[0] = spread[0] if math.isfinite(factor) else math.inf
+        spread *= factor if math.isfinite(factor) else 0.1
+        return replace(found, squares=spread * even if rounds else even)
 
     monkeypatch.setattr(Validation, "_adapted", further)
     monkeypatch.setattr(Validation, "judged", scattered)

@@ -26,7 +26,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import improves
+from nfriction.fitting.result.paired_test import improves, mean_gain
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -228,10 +228,14 @@ class _Contest:
 
     def train(self) -> None:
         """Find the best network, and reject it unless it beats the law; raises `StoppedError`."""
-        validation, before = self.validation, None
+        validation = self.validation
         self.best = validation.best_trial(_with_narrowed_priors(self.free, self.start))
-        while self.best.finite and self.best is not before:
-            before, self.best = self.best, validation.trained_on(self.best)
+        # Usually less than ten rounds; gains in the mean of windows could form a circle.
+        for _ in range(self.task.options.max_steps):
+            before = self.best
+            self.best = validation.trained_on(before) if before.finite else before
+            if self.best is before:
+                break
         self.rejected = self._compared()
         if not self.rejected:
             self.rejected = validation.lost_by_recording(self.best)
@@ -515,7 +519,7 @@ class Validation:
             better = moved if gained > self.options.evidence_gain else better
         judged = self.judged(replace(better, squares=self._errors(better.end, self.splits[0][1])))
         # The gain need not exceed its scatter: the last rounds of training each gain little.
-        if improves(judged.squares, trial.squares, chance=0.5):
+        if judged.finite and mean_gain(judged.squares, trial.squares)[0] > 0:
             return judged
         return judged if explained and not improves(trial.squares, judged.squares) else trial
 
