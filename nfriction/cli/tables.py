@@ -50,7 +50,8 @@ def fit_lines(name: str, fit: FitResult, rating: tuple[str, str]) -> str:
     verdict, reason = rating
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     head = f"{verdict} ({reason})" if reason else verdict
-    lines = [f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings]
+    beside = [warning for warning in fit.warnings if warning not in fit.status]
+    lines = [f"{name}: {head}. {fit.status.rstrip('.')}{note}", *beside]
     return "\n  - ".join(map(one_line, lines))
 
 

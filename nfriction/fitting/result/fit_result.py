@@ -356,7 +356,7 @@ class FitResult:
     def summary(self) -> str:
         """Usability, status, coefficients with 95 % intervals, and warnings, as text."""
         table = self.to_pandas().to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
-        warned = [f"- {warning}" for warning in self.warnings]
+        warned = [f"- {warning}" for warning in self.warnings if warning not in self.status]
         return "\n".join([self._head(), *(line.rstrip() for line in table.splitlines()), *warned])
 
     def _repr_html_(self) -> str:

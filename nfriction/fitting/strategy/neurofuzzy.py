@@ -110,13 +110,14 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     richer = contest.accepted or contest.start is not start
     if richer and task.leaves_noise(found):
         return found  # without what the fit of the law alone warned of, such as a delay
-    of_task = (*task.data_warnings, *task.smoothed)
-
-    def kept(texts: Sequence[str]) -> list[str]:
-        of_law = ".", ", as found with the constant law."
-        return [x if x in of_task or not richer else x.removesuffix(".") + of_law[1] for x in texts]
-
-    return found.with_warnings(kept(start.data_warnings), unmodelled=kept(start.unmodelled))
+    if not richer:
+        return found.with_warnings(start.data_warnings, unmodelled=start.unmodelled)
+    of_task, of_law = (*task.data_warnings, *task.smoothed), ", as found with the constant law."
+    texts, unmodelled = (
+        [x if x in of_task else x.removesuffix(".") + of_law for x in of_start]
+        for of_start in (start.data_warnings, start.unmodelled)
+    )
+    return found.with_warnings(texts, unmodelled=unmodelled)
 
 
 def _seeing(model: FrictionModel, names: Sequence[str] | None) -> FrictionModel:
@@ -262,7 +263,7 @@ class _Contest:
         if self.rejected or end is None or best is None:
             revert_to_constant(self.network, self.start, self.task.options)
             model.load_state_dict(self.network.state_dict())
-            seen = cast("NeuroFuzzyModel", self.task.model).inputs or ()
+            seen = getattr(self.task.model, "inputs", None) or ()
             law = f"constant law with {' and '.join(seen)}" if seen else "constant law"
             note = self.rejected.replace("constant law is kept", f"{law} is kept")
             return constant_kept(self.start, model, note, converged=not self.stopped)
