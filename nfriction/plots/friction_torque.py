@@ -63,7 +63,10 @@ def torque_over_velocity(
     joint = [r.joint_coordinates(plant) for r in recordings]
     motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
     known = uncertainty or {}
-    loads = {name: _median_load((plants or {}).get(name, plant), motions) for name in models}
+    loads = {
+        name: _median_load(model, (plants or {}).get(name, plant), motions)
+        for name, model in models.items()
+    }
     with torch.no_grad():
         parts = [
             _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
@@ -86,7 +89,7 @@ def torque_over_velocity(
             ax.plot(grid, factor * line, **looks[name].line)
             if name in known:
                 at = torch.as_tensor(grid)[:, None].expand(-1, plant.joints).contiguous()
-                load = load_at_rest(models[name].law, at) * loads[name]
+                load = loads[name].expand_as(at)
                 sd = known[name].torque_sd(models[name], at, load)[:, k].numpy()
                 _band(ax, grid, factor * line, factor * sd, looks[name].line["color"])
         ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
@@ -148,10 +151,11 @@ def velocities(qd: Array) -> Array:
     return grid[(grid >= low) & (grid <= high)]
 
 
-def _median_load(plant: Plant, motions: Sequence[Motion]) -> torch.Tensor:
-    """Median load of each joint along motions, (joint,)."""
+def _median_load(model: FrictionModel, plant: Plant, motions: Sequence[Motion]) -> torch.Tensor:
+    """Median load of each joint along motions, (joint,); zero drive torque for a gear."""
     loads = [plant.load(torch.as_tensor(m.q), torch.as_tensor(m.qd)) for m in motions]
-    return torch.cat(loads).median(0).values
+    median = torch.cat(loads).median(0).values
+    return load_at_rest(model.law, median) * median
 
 
 def _torque(model: FrictionModel, qd: Array, joint: int, load: torch.Tensor) -> Array:
@@ -159,8 +163,7 @@ def _torque(model: FrictionModel, qd: Array, joint: int, load: torch.Tensor) -> 
     velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
     with torch.no_grad():
         held = model.coefficients(velocity, torch.zeros_like(velocity))
-        loads = load_at_rest(model.law, velocity) * load
-        torque = model.steady_torque(velocity, loads, held)
+        torque = model.steady_torque(velocity, load.expand_as(velocity), held)
     return torque[:, joint].numpy()
 
 

@@ -229,14 +229,13 @@ class _Contest:
 
     def train(self) -> None:
         """Find the best network, and reject it unless it beats the law; raises `StoppedError`."""
-        validation = self.validation
+        validation, before = self.validation, None
         self.best = validation.best_trial(_with_narrowed_priors(self.free, self.start))
         # Usually less than ten rounds; gains in the mean of windows could form a circle.
         for _ in range(self.task.options.max_steps):
-            before = self.best
-            self.best = validation.trained_on(before) if before.finite else before
-            if self.best is before:
+            if not self.best.finite or self.best is before:
                 break
+            before, self.best = self.best, validation.trained_on(self.best)
         self.rejected = self._compared()
         if not self.rejected:
             self.rejected = validation.lost_by_recording(self.best)
@@ -576,11 +575,11 @@ class Validation:
         Hold-out windows may be shorter, and insensitive to small torque errors; and the last search
         may end at a worse minimum.
         """
+        if end.stopped:
+            return ""
         # From the states of the network's own fit: smoothed ones may lead to another minimum.
         simulated = end.problem.simulated_motions(end.result.x, self.motions)
         windows = self.law.cut(simulated, self.length, self.motions)
-        if end.stopped:
-            return ""
         law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
         loss = end.problem.loss
         of_law = loss.counted(self.of_start).square()
