@@ -52,6 +52,12 @@ class FitTask:
     smoothed: tuple[str, ...] = ()  # a warning of a wide smoothed sign
     ratios: Mapping[str, float] = field(default_factory=dict)  # of terms of `plant` to those given
 
+    @property
+    def offset_sd(self) -> Tensor | None:
+        """Prior of the encoder offsets, (recording, joint) [rad; m]; None if they are known."""
+        shape, sd = (len(self.recordings), self.plant.joints), self.options.encoder_offset_sd
+        return torch.full(shape, sd, dtype=torch.float64) if self.per_recording else None
+
     def warnings_beside(self, found: FitResult) -> tuple[str, ...]:
         """Those about the data, and on a wide smoothed sign if the residual exceeds the noise."""
         above = not self.mistakes and not self.leaves_noise(found)

@@ -152,7 +152,6 @@ def test_other_graphs_are_not_run_and_changed_numbers_are_detected(tmp_path: Pat
     package: Any = pytest.importorskip("onnx")
     model = LFM(2, [1e-3, 2e-3])
     path = onnx(model, tmp_path / "m.onnx")
-    assert verify_artefact(path, model, points=50).passed
     file = package.load(path)
     numbers = next(x for x in file.graph.initializer if list(x.dims) == [2, 2])  # coefficients
     numbers.raw_data = (1.001 * np.frombuffer(numbers.raw_data)).tobytes()

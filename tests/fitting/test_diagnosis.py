@@ -482,7 +482,7 @@ def test_a_torque_held_for_long_steps_is_no_delay():
         ("free", np.degrees, "positions are in degrees"),
         slow("free", lambda q: q * [4, 1], "4 times too large"),
         ("free", lambda q: q[::-1], "time runs backwards"),
-        ("driven", lambda q: q * [-1, 1], "the sign of joint1's position is reversed"),
+        slow("driven", lambda q: q * [-1, 1], "the sign of joint1's position is reversed"),
         ("driven", lambda q: q + np.array([0, math.pi]), "joint2's position is 180 degrees off"),
         slow("driven", lambda q: later(q, 10), "positions are recorded 2"),
         slow("motor", np.degrees, "positions are in degrees"),
@@ -502,7 +502,7 @@ def test_mistakes_in_positions_are_named(name, change, finding):
     [
         ("driven", lambda tau: -tau, "every torque has the wrong sign"),
         slow("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
-        ("driven", lambda tau: tau * [3.0, 0.4], "different factors: that of joint1 is 3"),
+        slow("driven", lambda tau: tau * [3.0, 0.4], "different factors: that of joint1 is 3"),
         slow(
             "driven", lambda tau: tau * [0.3, -1.0], "and that of joint2 has the wrong sign (torque"
         ),
@@ -825,7 +825,7 @@ def test_delay_is_named_beside_errors_of_a_drawing(seed):
     assert 0.025 < float(text.split(" ms later")[0].split()[-1]) / 1e3 < 0.032
 
 
-@pytest.mark.parametrize("seed", [4, 13])
+@pytest.mark.parametrize("seed", [4, slow(13)])
 def test_errors_of_a_drawing_are_no_gain_of_energy(seed):
     """The energy of a free swing rises if it is computed with slightly wrong terms."""
     links = {"mass": [0.2, 0.27, 0.34], "length": [0.3, 0.3, 0.23], "com": [0.12, 0.18, 0.08]}
@@ -865,7 +865,7 @@ def test_a_driven_motion_without_torque_is_named(name):
     assert "has no torque, but its motion gains energy up to" in found
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("backwards", [slow(False), True])
 def test_a_swing_that_gains_little_energy_is_named(backwards):
     """The torque balance is too coarse for weak friction; a fit is not."""
     swung = swing(pendulum(), CVFM(2, [[1e-3, 2e-4], [4e-4, 1e-4]]).requires_grad_(False))
@@ -886,7 +886,9 @@ def of_motor(plant: Plant, tau: np.ndarray) -> np.ndarray:
     return COUNT * np.round(found.q.numpy() / COUNT)
 
 
-@pytest.mark.parametrize("off", [slice(SAMPLES // 2, None), slice(SAMPLES // 3, 2 * SAMPLES // 3)])
+@pytest.mark.parametrize(
+    "off", [slice(SAMPLES // 2, None), slow(slice(SAMPLES // 3, 2 * SAMPLES // 3))]
+)
 def test_a_drive_that_is_off_for_a_while_is_named(off):
     """An emergency stop, for example, after which the log contains the command."""
     plant, _, commanded = measured("motor")
@@ -1180,7 +1182,8 @@ def test_wrongly_scaled_torques_are_named(name):
 
 
 @pytest.mark.parametrize(
-    ("scale", "inertia", "named"), [(1.15, 1.06, True), slow(1.0, 1.08, False), (1.0, 1.25, False)]
+    ("scale", "inertia", "named"),
+    [(1.15, 1.06, True), slow(1.0, 1.08, False), slow(1.0, 1.25, False)],
 )
 def test_torque_scale_is_named_despite_errors_of_the_rig(scale, inertia, named):
     """Only a common change of inertia and gravity beyond that of usual rig errors."""
@@ -1286,7 +1289,7 @@ def test_long_coasting_does_not_excuse_a_wrong_law():
     assert found.usability[0] == "doubtful"
 
 
-@pytest.mark.parametrize("scale", [0.93, 1.0, 1.08])
+@pytest.mark.parametrize("scale", [slow(0.93), 1.0, 1.08])
 def test_torque_constant_is_named_if_friction_leaves_its_interval(scale):
     plant, q, tau = measured("motor")
     recording = Recording(STEP * np.arange(len(q)), q, scale * tau, convention="relative,upright")
@@ -1332,7 +1335,7 @@ def test_encoder_without_visible_count_does_not_excuse_a_wrong_law():
     assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
 
 
-@pytest.mark.parametrize("every", [SAMPLES, 100])
+@pytest.mark.parametrize("every", [SAMPLES, slow(100)])
 def test_torque_spike_is_named_with_its_time(every):
     """Also if so many samples are spikes that they raise the quantiles of the curvature."""
     plant, q, tau = measured("driven")

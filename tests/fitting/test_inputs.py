@@ -16,12 +16,14 @@ from nfriction import (
     PendulumChain,
     Recording,
     Rotor,
+    Stribeck,
     fit,
     load,
     rollout,
     save,
 )
 from nfriction.export import c, mjcf, onnx, torchscript
+from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.result.identifiability import Interval
@@ -33,6 +35,7 @@ from nfriction.fitting.strategy.inputs import (
     candidates,
     chosen_inputs,
     friction_drives,
+    realigned,
     significant,
     widened_start,
     with_position_load,
@@ -580,3 +583,51 @@ def test_wavelengths_of_an_axis_are_limited_by_its_stroke() -> None:
     assert _recurring(task, law, seeing) == {0}
     other = seeing.plant.replace(load_waves=2.0 * seeing.plant.load_waves)
     assert _recurring(task, law, replace(seeing, plant=other)) == set()
+
+
+def zeroed(model: FrictionModel, seconds: float = 6.0) -> tuple[PendulumChain, Recording]:
+    """A driven link with a true encoder, whose zero a fit may doubt."""
+    plant = PendulumChain([0.5], [0.3], com=[0.2], inertia=[5e-3])
+    time = 2e-3 * torch.arange(round(500 * seconds), dtype=torch.float64)
+    tau = 0.8 * torch.sin(4 * time) + 0.5 * torch.sin(9.3 * time) + 0.4 * torch.sin(1.1 * time)
+    zero = torch.full((1,), math.pi, dtype=torch.float64)
+    run = rollout(plant, model, zero, 0 * zero, tau[:-1, None], sample_time=2e-3)
+    q = quantise(run.q.numpy() - math.pi, 65536)
+    recording = Recording(
+        time.numpy(), q, tau=tau.numpy()[:, None], convention=("relative", "hanging")
+    )
+    return plant, recording
+
+
+def test_encoder_offsets_are_fitted_again_with_inputs() -> None:
+    """A law without the input shifts them, and then no value of the input fits the data."""
+    law = with_inputs(COULOMB_VISCOUS, ["direction"])
+    true = FrictionModel(law, Constant(law, 1, [[0.1, 0.02, 0.3]]), V_SMOOTH).requires_grad_(False)
+    plant, recording = zeroed(true)
+    brief = {"windows": (0.5, 2.0), "fit_plant": False, "encoder_reference": "per_recording"}
+    start = fit(CVFM(1, v_smooth=V_SMOOTH), plant, recording, **brief)
+    model = NFCVFM(1, v_smooth=V_SMOOTH)
+    task = prepare_task(model, plant, [recording], FitOptions(**brief))
+    recordings, motions = apply_encoder_offsets(
+        start.encoder_offsets, plant, task.recordings, task.motions
+    )
+    task = replace(task, recordings=recordings, motions=motions)
+    found = widened_start(task, start, ["direction"])
+    assert abs(start.encoder_offsets[0][0]) > 1e-2
+    assert abs(found.encoder_offsets[0][0]) < 1e-4
+    assert found.residual < 1.2 * found.noise
+    moved = realigned(task, start, found)
+    np.testing.assert_allclose(moved.recordings[0].q, recording.q + math.pi, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_encoder_offsets_are_fitted_again_with_a_network() -> None:
+    true = Stribeck(1, [0.1, 0.1, 0.02, 1.0, 2.0], v_smooth=V_SMOOTH).requires_grad_(False)
+    plant, recording = zeroed(true)
+    brief = {"windows": (0.5, 2.0), "fit_plant": False, "encoder_reference": "per_recording"}
+    start = fit(CVFM(1, v_smooth=V_SMOOTH), plant, recording, **brief)
+    found = fit(NFCVFM(1, v_smooth=V_SMOOTH, inputs=[]), plant, recording, **brief)
+    assert found.effective_parameters
+    (before,), (after,) = start.encoder_offsets[0], found.encoder_offsets[0]
+    assert abs(after) < 0.3 * abs(before)
+    assert found.residual < 1.5 * found.noise

@@ -271,18 +271,30 @@ def scale_warning(
 def gain_warnings(
     problem: ShootingProblem, intervals: Sequence[Interval]
 ) -> Iterator[tuple[str, bool]]:
-    """A sentence for each torque gain beyond its prior's standard deviation; true beyond 95 %."""
-    sd = problem.options.gain_term[1]
+    """A sentence for each torque gain that matters, and whether the friction is doubtful.
+
+    A gain matters if its whole interval takes a coefficient of torque out of its own. Where there
+    are no such intervals, as with networks, it is named beyond its prior's standard deviation, and
+    doubtful beyond 95 %.
+    """
+    sd, law = problem.options.gain_term[1], problem.friction.law.coefficients
     for one in intervals:
         term, _, place = one.name.rpartition(" ")
-        if term == "torque gain" and one.low * one.high > 0 and abs(one.value) > sd:
-            joint = problem.jacobian.plant.joint_names[int(place) - 1]
+        if term != "torque gain" or one.low * one.high <= 0:
+            continue
+        joint = problem.jacobian.plant.joint_names[int(place) - 1]
+        own = {f"{c.name} of {joint}" for c in law if c.unit.startswith("N")}
+        friction = [i for i in intervals if i.name in own]
+        least = 1 + min(one.low, one.high, key=abs)
+        doubtful = any(not i.low <= i.value * least <= i.high for i in friction)
+        doubtful |= not friction and abs(one.value) > identifiability.NORMAL_95 * sd
+        if doubtful or (not friction and abs(one.value) > sd):
             text = (
                 f"Torques of {joint} are recorded {1 / (1 + one.value):.3g} times as large as "
                 "those of the other joints (torque constant, gear ratio, unit), and its friction "
                 "with them."
             )
-            yield text, abs(one.value) > identifiability.NORMAL_95 * sd
+            yield text, doubtful
 
 
 def rotor_warning(

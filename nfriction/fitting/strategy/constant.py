@@ -80,7 +80,8 @@ def fit_constant(task: FitTask) -> FitResult:
     other_starts = None if linear else equation_error
     search = horizon_continuation(fitter, friction, plant, task.motions, other_starts)
     # A nonlinear law may end in a local minimum that its nested law does not have.
-    if (law := model.law.nested_law) is not None and not search.end.stopped:
+    law, lowest = model.law.nested_law, search.reason in ("", "noisy") and search.end.explained
+    if law is not None and not (search.end.stopped or lowest):
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
         nested = _fitter(task, contained, by_torque, eccentric)
@@ -158,12 +159,10 @@ def _fitter(
         plant, model.law, task.recordings, options, eccentric=eccentric,
         per_recording=task.per_recording,
     )  # fmt: skip
-    sd = options.encoder_offset_sd
-    shape = (len(task.recordings), plant.joints)
     return ShootingFitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, options,
         task.callback, friction_prior=constant_prior(model, torque, options),
-        offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
+        offset_sd=task.offset_sd,
     )  # fmt: skip
 
 

@@ -76,6 +76,17 @@ class HorizonResult:
         """True if the noise of encoders and torques explains the residuals."""
         return explained(self.problem, self.result.x, self.rms)
 
+    @cached_property
+    def log_volume(self) -> float:
+        """Logarithm of the volume of the friction's uncertainty; NaN if it is infinite."""
+        problem, options = self.problem, self.problem.options
+        lower, upper = problem.variables.bounds()
+        fitted = (lower < upper)[: problem.variables.shared_count].nonzero().flatten()
+        sd = hac_sd(self.residuals, bandwidth(problem.windows.q, options), options)
+        known = gathered_information(problem, self.result.x, sd).subset(fitted)
+        root = covariance_root(known)[fitted < problem.variables.friction_count]
+        return float(torch.linalg.slogdet(root @ root.T)[1])
+
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows show only that the motion is chaotic within them."""
         longer = self.problem.windows.length / before.problem.windows.length
@@ -394,18 +405,7 @@ def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
     noisy = any(sd.any() for sd in torque_noise(found.problem.windows))
     if same or not noisy or not before.explained:
         return False
-    return _log_volume(found) > _log_volume(before)
-
-
-def _log_volume(of: HorizonResult) -> float:
-    """Logarithm of the volume of the friction's uncertainty; NaN if it is infinite."""
-    problem, options = of.problem, of.problem.options
-    lower, upper = problem.variables.bounds()
-    fitted = (lower < upper)[: problem.variables.shared_count].nonzero().flatten()
-    sd = hac_sd(of.residuals, bandwidth(problem.windows.q, options), options)
-    known = gathered_information(problem, of.result.x, sd).subset(fitted)
-    root = covariance_root(known)[fitted < problem.variables.friction_count]
-    return float(torch.linalg.slogdet(root @ root.T)[1])
+    return found.log_volume > before.log_volume
 
 
 def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import NOTHING, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
@@ -39,6 +40,7 @@ from nfriction.plant import PendulumChain, Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.signals import Motion
 
+Offsets = tuple[tuple[float, ...], ...]
 # Cooling times, in durations of a recording, above which it shows no cooling: 3 % of the heat.
 SLOW_COOLING = 30.0
 # Waves of friction over the position, per turn or per stroke of an axis.
@@ -219,15 +221,18 @@ def _fitter(
     return ShootingFitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, task.options,
         task.callback, friction_prior=constant_prior(model, torque, task.options),
+        offset_sd=task.offset_sd,
     )  # fmt: skip
 
 
 def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
     """Constant fit of a law with inputs, started from that without; None if stopped.
 
-    Windows grow to those of the law, where it may be far from the law with inputs. The cooling time
-    of heat minimises the residual over the shortest windows, between their length (within which a
-    network responds to the motion itself) and `SLOW_COOLING` times the longest recording.
+    The task is without the encoder offsets of that fit; they are fitted again, because a law that
+    lacks an input shifts them. Windows grow to those of the law, where it may be far from the law
+    with inputs. The cooling time of heat minimises the residual over the shortest windows, between
+    their length (within which a network responds to the motion itself) and `SLOW_COOLING` times the
+    longest recording.
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
@@ -240,15 +245,15 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     ) -> HorizonResult:
         """The last of searches over these windows, each from the end of the previous one."""
         fitter, options = widened_fitter(task, start, inputs, cooling_time), task.options
-        friction = fitter.friction.schedule.parameter_vector()
+        friction, offsets = fitter.friction.schedule.parameter_vector(), None
         plant, noise = known_terms(start, fitter.jacobian.terms), options.first_noise
         simulated = task.motions
         for k, length in enumerate(windows):
             if end is not None:
-                noise, (friction, plant, *_) = max(end.noise, options.min_noise), end.parts
+                noise, (friction, plant, _, offsets) = max(end.noise, options.min_noise), end.parts
                 simulated = end.problem.simulated_motions(end.result.x, simulated)
             problem = fitter.problem(fitter.cut(simulated, length, task.motions), noise, friction)
-            x, stopped = settle_states(problem, problem.variables.start(plant))
+            x, stopped = settle_states(problem, problem.variables.start(plant, offsets))
             near = float(problem.cost(x)) if end is None else weighted_cost(end.residuals, noise)
             last = k + 1 == len(windows)
             tolerance = loglik_tolerance(near, options) if last else options.loose_tolerance
@@ -285,10 +290,21 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
     except StoppedError:
         return None
     model = copy.deepcopy(end.problem.friction)
-    return replace(
-        result_from_shooting(model, end.problem, end.result, task.motions),
-        encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons,
-    )  # fmt: skip
+    fitted = result_from_shooting(model, end.problem, end.result, task.motions)
+    offsets = added(start.encoder_offsets, fitted.encoder_offsets)
+    return replace(fitted, encoder_offsets=offsets, skipped_horizons=start.skipped_horizons)
+
+
+def added(offsets: Offsets, more: Offsets) -> Offsets:
+    """Encoder offsets of a fit to recordings without the offsets of an earlier one."""
+    return tuple(map(tuple, np.add(offsets, more).tolist()))
+
+
+def realigned(task: FitTask, before: FitResult, after: FitResult) -> FitTask:
+    """A task without the encoder offsets of a fit, without those of a later fit instead."""
+    moved = np.subtract(after.encoder_offsets, before.encoder_offsets).tolist()
+    recordings, motions = apply_encoder_offsets(moved, task.plant, task.recordings, task.motions)
+    return replace(task, recordings=recordings, motions=motions)
 
 
 @torch.no_grad()
@@ -335,7 +351,7 @@ def chosen_inputs(
             best = choice.best(held, task.options.input_evidence) if choice else None
             found += [best] if best else []
         if not found:
-            return tuple(chosen), at, seeing
+            return tuple(chosen), at, realigned(seeing, start, at)
         _, gain = max(found, key=lambda one: one[0])
         widening = placed if gain.name == "position" else seeing
         widening = replace(widening, plant=seeing_plant(widening.plant, [gain.name]))

@@ -79,6 +79,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         fitter = inputs.widened_fitter(aligned, start, given, inputs.longest_duration(motions))
         plant = inputs.with_waves_of(aligned.plant, start.plant)
         start = replace(start, model=fitter.friction, plant=plant)
+    else:
+        aligned = inputs.realigned(aligned, start, widened)
     contest = _Contest(aligned, widened or start)
     chosen: tuple[inputs.InputGain, ...] = ()
     try:
@@ -93,8 +95,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         model.see([gain.name for gain in chosen] or None)
         model.selected = bool(chosen)
     found = replace(
-        contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
-        skipped_horizons=start.skipped_horizons, inputs=chosen,
+        contest.result(model), motions=task.motions, skipped_horizons=start.skipped_horizons,
+        inputs=chosen,
     )  # fmt: skip
     said = [gain.words(found.plant.joint_names) for gain in chosen]
     # Only what the constant fit shows: a network's parameters have no intervals.
@@ -197,7 +199,7 @@ class _Contest:
         self.free = ShootingFitter(
             StepJacobian(task.plant, self.network, terms), self.network, task.recordings,
             task.measurement, options, task.callback,
-            plant_prior=(known_terms(start, terms), plant_sd),
+            plant_prior=(known_terms(start, terms), plant_sd), offset_sd=task.offset_sd,
             extrapolation=prior_on_unvisited_cells(schedule, task.motions, options),
         )  # fmt: skip
         law = replace(self.free, friction=start.model, friction_prior=law_prior, extrapolation=None)
@@ -279,6 +281,7 @@ class _Contest:
         return replace(
             result,
             model=model.requires_grad_(False),
+            encoder_offsets=inputs.added(self.start.encoder_offsets, result.encoder_offsets),
             status=result.status + moved,
             intervals=known + result.intervals,
             effective_parameters=effective_parameters(end),
