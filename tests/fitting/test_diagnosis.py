@@ -903,6 +903,19 @@ def test_a_drive_that_is_off_for_a_while_is_named(off):
     assert "although a torque is recorded (set it to 0)" in warning
 
 
+@pytest.mark.parametrize(("sine", "named"), [(1.0, True), (0.15, False)])
+def test_a_joint_held_by_a_brake_is_named(sine, named):
+    """Without a torque, friction of 0.3 N m holds a little of the weight of 1.5 N m."""
+    plant, q, tau = measured("motor")
+    stop = 1000 + int(np.abs(np.abs(np.sin(q[1000:2000, 0])) - sine).argmin())
+    held, driven = q.copy(), tau.copy()
+    held[stop:], driven[stop:] = q[stop], 0.0
+    (warning,) = warnings_of(plant, held, driven)
+    found = re.search(r"joint1 of recording 1 rests from (\S+) to \S+ s against 1.5 N m", warning)
+    assert (found is not None) == named
+    assert not named or float(found[1]) == pytest.approx(STEP * stop, abs=0.1)
+
+
 def turned(stop: float, effort: float, seed: int) -> Recording:
     """A driven wheel of 0.02 kg m^2 between two stops [rad], from which it bounces a little."""
     time, random, h = np.arange(5001) / 500, np.random.default_rng(seed), 1 / 5000

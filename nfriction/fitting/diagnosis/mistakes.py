@@ -89,10 +89,12 @@ def likely_mistakes(
         return stated, tuple(stops)
     # With different zeros, recordings of the same rig have different balances.
     unlike = [*_unlike_zeros(plant, given)] if len(recordings) > 1 else []
-    found = [] if zeroed else unlike.copy()
+    # The shock of a brake looks like other mistakes, and a wrong rig seems to be held.
+    held = [*_held(plant, given)] if given.driven else []
+    found = held if zeroed else held + unlike
     if noise < stated:
-        zeros = min((x.unexplained for x in unlike), default=math.inf)
-        found += _above_noise(plant, convention, given, zeros, presliding)
+        least = min((x.unexplained for x in held + unlike), default=math.inf)
+        found = found + _above_noise(plant, convention, given, least, presliding)
     if not found and not given.tau.any():
         # With a slightly wrong rig, the energy would seem to rise.
         rig = _with_usual_errors(plant, given)
@@ -105,11 +107,11 @@ def likely_mistakes(
 
 
 def _above_noise(
-    plant: Plant, convention: AngleConvention, given: Samples, zeros: float, presliding: bool
+    plant: Plant, convention: AngleConvention, given: Samples, least: float, presliding: bool
 ) -> list[Mistake]:
     """Mistakes whose correction divides the unexplained torque by `diagnosis_ratio`, simple first.
 
-    `zeros` is the share that different encoder zeros of the recordings leave.
+    `least` is the share that different encoder zeros of the recordings, or no rests held, leave.
     """
     stated, options = unexplained_share(plant, given), given.options
     sound, noise = stated, options.diagnosis_ratio * noise_share(plant, given, given.sd_of_mean)
@@ -134,7 +136,7 @@ def _above_noise(
     if sound <= noise:
         return []
     if len(given.recordings) > 1:
-        most = min(sound, zeros) / options.diagnosis_ratio
+        most = min(sound, least) / options.diagnosis_ratio
         tested += _odd_one_out(plant, convention, given.source, most)
     most = sound / options.diagnosis_ratio
     # Near one position a spring is like gravity, and a ratio like a unit.
@@ -253,8 +255,8 @@ def correction_note(stated: float, mistake: Mistake) -> str:
 
 
 def _shares(stated: float, mistake: Mistake) -> str:
-    """A sentence on the torque unexplained before and after a correction; empty if unknown."""
-    if math.isnan(mistake.unexplained):
+    """A sentence on the torque unexplained before and after a correction; empty if about equal."""
+    if not DEFAULTS.diagnosis_ratio * mistake.unexplained < stated:
         return ""
     after = f"after the correction {mistake.unexplained:.2g}"
     return f" Friction leaves {stated:.2g} of the torque unexplained, {after}."
@@ -374,6 +376,54 @@ def _end_stops(plant: Plant, given: Samples) -> Iterator[Mistake]:
         if said:
             text = f"{plant.joint_names[j]} runs into end stops near {' and '.join(said)}"
             yield Mistake(f"{text}, which the rig lacks (cut these parts off)", math.nan)
+
+
+def _held(plant: Plant, given: Samples) -> Iterator[Mistake]:
+    """Driven joints at rest against more torque than friction can hold, with the time of each rest.
+
+    Static friction may exceed that of sliding, but neither `diagnosis_ratio` times the usual torque
+    of sliding nor 95 % of the torques elsewhere, of which slow motion has its own share.
+    """
+    # Every block, because a rest may be short.
+    every = replace(given.options, diagnosis_samples=sum(map(len, given.recordings)))
+    data, rig = collect(given.source._replace(options=every)), _with_usual_errors(plant, given)
+    needed, rest, said = data.needed(rig), torch.zeros_like(data.q), []
+    free = torch.ones_like(given.time)
+    edge = 2 * given.options.diagnosis_block + given.options.edge
+    inertial = data.mean(needed - rig.inverse_dynamics(data.q, rest, rest)).abs()
+    torque, speed = data.mean(data.tau - needed).abs(), data.mean(data.qd.abs())
+    number, time = (data.mean(x.to(data.q))[:, 0] for x in (data.number, data.time))
+    for j in data.driven:
+        slow = speed[:, j] < ALIKE**2 * speed[:, j].max()
+        change = (slow[1:] != slow[:-1]) | (number[1:] != number[:-1])
+        runs = torch.arange(len(slow)).tensor_split(change.nonzero().flatten() + 1)
+        rests = [run for run in runs if slow[run[0]] and len(run) >= FEWEST_BLOCKS]
+        elsewhere = torch.ones_like(slow).index_fill(0, torch.cat([runs[0][:0], *rests]), False)
+        sliding = elsewhere & (data.moving[:, j] > 0)
+        if not rests or not sliding.any():
+            continue
+        usual = torque[sliding, j].quantile(0.5)
+        others = [torque[x, j].quantile(0.95) for x in (sliding, elsewhere & slow) if x.any()]
+        most = max(given.options.diagnosis_ratio * usual, *others)
+        for run in rests:
+            # The torque of inertia is not certain.
+            held = (held := torque[run, j] - inertial[run, j])[held > most]
+            if len(held) >= FEWEST_BLOCKS:
+                first, last, k = time[run[0]], time[run[-1]], number[run[0]]
+                # With the shocks at its ends, which smoothing spreads.
+                near = (given.time - (first + last) / 2).abs() < (last - first) / 2 + edge
+                free[near & (given.number == k)] = 0.0
+                of = f"{plant.joint_names[j]} of {names_of(data.recordings)[int(k)]}"
+                said.append(
+                    f"{of} rests from {first:.3g} to {last:.3g} s against "
+                    f"{held.median():.2g} {plant.effort_unit} and slides against {usual:.2g}"
+                )
+    if said:
+        causes = (
+            "a brake, an end stop, an obstacle or a drive that is off (leave these samples out)"
+        )
+        share = unexplained_share(plant, replace(given, turns=given.turns * free))
+        yield Mistake(f"{', '.join(said[:3])}: {causes}", share)
 
 
 def _unlike_zeros(plant: Plant, data: Samples) -> Iterator[Mistake]:
