@@ -352,6 +352,28 @@ def test_change_is_detected_if_friction_dominates_the_torque(fall, constants):
         assert abs(float(found) - 100 * fall) < float(within) + 1 < 6
 
 
+@pytest.mark.parametrize("falls", [(0.0, 0.0), (0.3, 0.15)])
+def test_unequal_falls_in_two_recordings_are_no_less_evident(falls):
+    """In the middle of each, the usual friction fits better than the usual fall."""
+    recordings, rng = [], np.random.default_rng(0)
+    time = 0.004 * np.arange(5001)[:, None]
+    for k, fall in enumerate(falls):
+        rate = np.array([0.9, 1.7, 3.1]) + 0.2 * k
+        q, qd, qdd = (
+            0.1 * (rate**n * np.sin(rate * time + 0.5 * n * math.pi)).sum(1, keepdims=True)
+            for n in range(3)
+        )
+        tau = 3.5 * qdd + (1 - fall * time / time[-1]) * (12 * np.sign(qd) + 15 * qd)
+        tau += 0.1 * rng.normal(size=q.shape)
+        recordings.append(Recording(time[:, 0], q + 1e-5 * rng.normal(size=q.shape), tau, unit="m"))
+    motions = [kalman_smoother(r.time, r.q) for r in recordings]
+    warned = list(changing_friction(LinearAxis(3.5), recordings, motions, FitOptions()))
+    during = [text for kind, text in warned if kind == "friction" and "during a record" in text]
+    assert [float(re.search(r"falls by (\S+) ±", text)[1]) for text in during] == pytest.approx(
+        [23] * (falls[0] > 0), abs=3
+    )
+
+
 @pytest.mark.parametrize("drift", [0.0, 1.0, -1.0])
 def test_drifting_offset_of_a_force_sensor_is_named(drift):
     """The drift is at most a twelfth of the friction."""

@@ -14,7 +14,12 @@ from nfriction.fitting.data.inputs import names_of
 from nfriction.fitting.diagnosis.balance import Samples, Source, collect
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.fitting.result.paired_test import improves, jackknife_sd, student_quantile
+from nfriction.fitting.result.paired_test import (
+    improves,
+    jackknife_sd,
+    student_quantile,
+    total_gain,
+)
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -92,9 +97,10 @@ def changing_friction(
                 best = friction_alone
             # A change of 1 % hardly shows in a simulation.
             least = best.sd * student_quantile(pieces - 1, 1 - options.drift_chance / 2)
-            if abs(best.rate) > max(0.01, least) and improves(
-                best.growing, best.constant, options.drift_chance
-            ):
+            # In sums, because a change shows at its ends, and hardly in the pieces between.
+            gain, spread = total_gain(best.growing, best.constant)
+            sure = gain > spread * student_quantile(pieces - 1, 1 - options.drift_chance)
+            if sure and abs(best.rate) > max(0.01, least):
                 yield best.of, best.sentence(plant, joint, student_quantile(pieces - 1, 0.975))
 
 
