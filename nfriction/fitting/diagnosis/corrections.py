@@ -58,7 +58,7 @@ def corrected_positions(
 ) -> Iterator[Mistake]:
     names, first, joints = plant.joint_names, plant.first_link, plant.joints
     chain = isinstance(plant, PendulumChain)
-    eye, none = np.eye(joints), np.zeros(joints)
+    eye, none, degree = np.eye(joints), np.zeros(joints), math.pi / 180
 
     def recorded(
         matrix: Array, offset: Array = none, reading: AngleConvention = convention
@@ -84,9 +84,12 @@ def corrected_positions(
             yield tried(
                 text, plant, replace(mirrored, tau=given.tau * torch.as_tensor(1 - 2 * eye[j]))
             )
-        # The counts of an encoder's revolution, in quadrature or not.
-        for factor in (0.25, 0.5, 2.0, 4.0):
-            text = f"{name}'s position is {1 / factor:g} times too large (counts per revolution)"
+        # The counts of an encoder's revolution, in quadrature or not, and columns in two units.
+        causes = dict.fromkeys((0.25, 0.5, 2.0, 4.0), "counts per revolution")
+        if joints > 1 and plant.unit == "rad":
+            causes |= {degree: "degrees read as radians", 1 / degree: "radians read as degrees"}
+        for factor, cause in causes.items():
+            text = f"{name}'s position {_wrong_by(factor, f' ({cause})')}"
             yield tried(text, plant, recorded(eye + (factor - 1) * own))
         # A half turn of the first link is a matter of the convention.
         turns = (-90, 90) if j == first else (-90, 90, 180)
@@ -95,7 +98,10 @@ def corrected_positions(
             yield tried(text, plant, recorded(eye, math.radians(degrees) * eye[j]))
     # On a driven rig this is equivalent to reversed torques, which are also listed.
     yield tried("the signs of all positions are reversed", plant, recorded(-eye))
-    for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
+    units = {"degrees": degree, f"m{plant.unit}": 1e-3}
+    if plant.unit == "rad":
+        units["radians, but were read as degrees"] = 1 / degree
+    for unit, factor in units.items():
         yield tried(f"positions are in {unit}", plant, recorded(factor * eye))
     yield tried("time runs backwards: the motion gains energy", plant, given.at_rate(-1.0))
     if chain:
@@ -294,7 +300,7 @@ def corrected_torques(plant: Plant, given: Samples) -> Iterator[Mistake]:
 
 
 def _wrong_by(gain: float, causes: str = "") -> str:
-    """The error of a torque that must be multiplied by a gain, in a clause."""
+    """The error of a torque or position that must be multiplied by a gain, in a clause."""
     if -1.5 < gain < -0.7:
         return "has the wrong sign"
     size, way = (1 / gain, "large") if abs(gain) < 1 else (gain, "small")
