@@ -165,6 +165,17 @@ def test_unusual_gain_of_one_drive_is_named():
     assert found.usability[0] == "doubtful"
 
 
+def test_a_torque_constant_that_the_fit_corrects_is_no_wrong_rig():
+    plant, time = PendulumChain(**DOUBLE | {"armature": [0.02, 0.01]}), STEP * np.arange(SAMPLES)
+    rate = np.array([[1.1, 2.3], [2.9, 1.7], [4.3, 5.1]])
+    waves = [rate**n * np.sin(rate * time[:, None, None] + n * math.pi / 2) for n in range(3)]
+    q, qd, qdd = (0.3 * torch.as_tensor(wave.sum(1)) for wave in waves)
+    dry, viscous = torch.tensor([[0.2, 0.1], [0.1, 0.05]])
+    tau = (plant.inverse_dynamics(q, qd, qdd) + dry * torch.sign(qd) + viscous * qd).numpy()
+    tau += 0.01 * np.random.default_rng(0).normal(size=tau.shape)
+    assert warnings_of(plant, q.numpy(), tau * [1, 1.18]) == ()
+
+
 @pytest.mark.parametrize(("grown", "named"), [(0.2, True), (1.0, False)])
 def test_torque_scale_that_changes_is_no_change_of_friction(grown, named):
     """It differs by no more than the torque constants of two drives may."""

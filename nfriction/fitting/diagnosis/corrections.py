@@ -274,22 +274,27 @@ def several_terms(plant: Plant, given: Samples) -> Iterator[Mistake]:
         yield Mistake(text, unexplained_share(rig, given), None, rig, ratios, timed)
 
 
-def corrected_torques(plant: Plant, given: Samples) -> Iterator[Mistake]:
-    driven = given.driven
-    groups = [(f"the {plant.effort} of {plant.joint_names[j]}", [j]) for j in driven]
-    if len(driven) > 1:
-        groups.append((f"every {plant.effort}", driven))
+def torque_gains(plant: Plant, given: Samples) -> Iterator[tuple[str, float, Samples]]:
+    """Each drive, and all together, with the gain of the torque that explains most."""
+    groups = [(f"the {plant.effort} of {plant.joint_names[j]}", [j]) for j in given.driven]
+    if len(groups) > 1:
+        groups.append((f"every {plant.effort}", given.driven))
     for what, joints in groups:
         part = torch.zeros_like(given.tau)
         part[:, joints] = given.tau[:, joints]
         # The gain is estimated together with the friction, which would bias a ratio of torques.
         without = replace(given, tau=given.tau - part)
         gain = float(solve_balance(without, without.tau - given.needed(plant), part)[1])
+        yield what, gain, replace(given, tau=given.tau + (gain - 1) * part)
+
+
+def corrected_torques(plant: Plant, given: Samples) -> Iterator[Mistake]:
+    for what, gain, scaled in torque_gains(plant, given):
         if gain and abs(gain - 1) > given.options.gain_term[0]:
             text = f"{what} {_wrong_by(gain, ' (a unit, torque constant or gear ratio)')}"
-            yield tried(text, plant, replace(given, tau=given.tau + (gain - 1) * part))
+            yield tried(text, plant, scaled)
     needed = given.needed(plant)
-    for j in driven:
+    for j in given.driven:
         tau = given.tau[:, j]
         # If gravity requires only one sign, this changes nothing.
         if bool((tau >= 0).all() or (tau <= 0).all()) and tau.min() < tau.max():

@@ -133,6 +133,9 @@ def _above_noise(
             # Without a drive, a guessed inertia is likelier than a missing rotor.
             place = len(tested) if given.driven else 0
             tested.insert(place, Mistake(text, share, (rig, given)))
+    for _, gain, scaled in corrections.torque_gains(plant, given):
+        if abs(gain - 1) <= options.gain_term[0]:
+            sound = min(unexplained_share(plant, scaled), sound)  # The fit corrects this, too.
     if sound <= noise:
         return []
     if len(given.recordings) > 1:
