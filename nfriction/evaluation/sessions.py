@@ -9,19 +9,22 @@ Spiegelhalter 2009, J. R. Stat. Soc. A 172, p. 137).
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 
-from nfriction.evaluation.parallel import Progress, as_completed, check_jobs
+from nfriction.evaluation.parallel import INTERRUPTED, Progress, as_completed, check_jobs
+from nfriction.fitting.data.inputs import as_model, refuse_repeated
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import Usability
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
-from nfriction.recording import Array, RecordingLike
+from nfriction.recording import Array, Recording, RecordingLike
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +46,7 @@ class SessionFit(NamedTuple):
     status: str
     usability: tuple[Usability, str]
     warnings: tuple[str, ...]
+    v_smooth: float  # width of the smoothed sign of the velocity [rad/s; m/s]
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class SessionsResult:
     """Friction of a machine over its sessions.
 
     Attributes:
-        spreads: mean, spread and intervals of each parameter.
+        spreads: mean, spread and intervals of each parameter, over the sessions that have it.
         failed: reason by session that could not be fitted, or whose fit is not to be used; its
             values do not count.
     """
@@ -82,8 +86,8 @@ class SessionsResult:
 
 
 def fit_sessions(
-    model: FrictionModel,
-    plant: Plant,
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
     sessions: Mapping[str, Session],
     *,
     jobs: int = 1,
@@ -93,10 +97,11 @@ def fit_sessions(
     """Fit a constant model to every session, and its spread between sessions.
 
     Args:
-        model: with constant coefficients; it stays as it is.
-        plant: the mechanism as given, the same for all.
+        model: with constant coefficients, which stays as it is; or its name.
+        plant: the mechanism as given, its name, or the path of a rig file; the same for all.
         sessions: recordings, or paths of recordings, by session: a day, a temperature, a unit. A
-            path is read in the process that fits it, so memory does not grow with their number.
+            path is read to refuse repeated recordings, and again in the process that fits it, so
+            memory does not grow with their number.
         jobs: processes, -1 for one per core; with `joblib.parallel_config(backend="dask")`
             those of a cluster.
         progress: receives the labels.
@@ -104,29 +109,40 @@ def fit_sessions(
 
     Returns:
         Means, spreads and intervals. Sessions that cannot be fitted, or whose fit is rated "do not
-        use", are listed, not fatal.
+        use", are listed, not fatal; so are those that a Ctrl-C leaves out after three fits.
 
     Raises:
-        ValueError: for fewer than 3 sessions, coefficients that follow the motion, or if fewer than
-            3 sessions could be fitted.
+        TypeError: if model, plant or recordings have another type.
+        ValueError: for fewer than 3 sessions, a recording given twice, coefficients that follow the
+            motion, or if fewer than 3 sessions could be fitted.
         ImportError: if `jobs` needs joblib and it is not installed.
     """
     check_jobs(jobs)
-    if model.schedule.follows_motion:
+    plant = rigs.of(plant)
+    mean = copy.deepcopy(as_model(model, plant.joints))
+    if mean.schedule.follows_motion:
         raise ValueError("a spread between sessions is estimated for constant coefficients only.")
     if len(sessions) < 3:
         raise ValueError(
             f"a spread needs at least 3 sessions, got {len(sessions)}; `fit` takes recordings of "
             "one session together."
         )
+    refuse_repeated(_read(plant, sessions))
     fits: dict[str, SessionFit] = {}
     failed: dict[str, str] = {}
     tasks = {label: (model, plant, session, fit_settings) for label, session in sessions.items()}
-    for label, found in as_completed(_fit_session, tasks, jobs=jobs, progress=progress):
-        if isinstance(found, str):
-            failed[label] = found
-        else:
-            fits[label] = found
+    progress = progress or Progress()
+    try:
+        for label, found in as_completed(_fit_session, tasks, jobs=jobs, progress=progress):
+            if isinstance(found, str):
+                failed[label] = found
+            else:
+                fits[label] = found
+    except KeyboardInterrupt:
+        if len(fits) < 3:
+            raise
+        progress.resume()
+        failed |= {label: INTERRUPTED for label in sessions if label not in {**fits, **failed}}
     if len(fits) < 3:
         first = next(iter(failed.items()))
         raise ValueError(
@@ -135,25 +151,38 @@ def fit_sessions(
         )
     # In the order given, whichever ended first.
     fits = {label: fits[label] for label in sessions if label in fits}
+    names = dict.fromkeys(name for f in fits.values() for name in f.values)
+    having = {name: [f for f in fits.values() if name in f.values] for name in names}
     spreads = tuple(
         random_effects(
-            name,
-            np.array([f.values[name] for f in fits.values()]),
-            np.array([f.sd[name] for f in fits.values()]),
+            name, np.array([f.values[name] for f in of]), np.array([f.sd[name] for f in of])
         )
-        for name in next(iter(fits.values())).values
+        for name, of in having.items()
     )
     # Coefficients that are not fitted stay as they are.
-    mean, means = copy.deepcopy(model), {s.name: s.mean for s in spreads}
+    means = {s.name: s.mean for s in spreads}
     own = mean.schedule.parameter_vector().tolist()
-    labels = mean.schedule.parameter_names(rigs.of(plant).joint_names)
+    labels = mean.schedule.parameter_names(plant.joint_names)
     vector = [means.get(name, x) for name, x in zip(labels, own, strict=True)]
     mean.schedule.set_parameter_vector(torch.tensor(vector, dtype=torch.float64).nan_to_num(0.0))
+    mean.v_smooth = min(f.v_smooth for f in fits.values())
     return SessionsResult(mean.requires_grad_(False), spreads, fits, failed)
 
 
+def _read(plant: Plant, sessions: Mapping[str, Session]) -> Iterator[Recording]:
+    """Recordings of the sessions that can be read, those of one in memory at a time."""
+    for label, session in sessions.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the fit repeats them
+            try:
+                recordings = Recording.many(session, plant=plant)
+            except (ValueError, OSError):
+                continue
+        yield from (recording._replace(name=f"session {label}") for recording in recordings)
+
+
 def _fit_session(
-    model: FrictionModel, plant: Plant, session: Session, settings: dict[str, Any]
+    model: FrictionModel | str, plant: Plant, session: Session, settings: dict[str, Any]
 ) -> SessionFit | str:
     """Estimates from a session, or the reason why there are none."""
     try:
@@ -172,6 +201,7 @@ def _fit_session(
         found.status,
         (rating, reason),
         found.warnings,
+        found.model.v_smooth,
     )
 
 

@@ -16,7 +16,8 @@ from nfriction import (
     fit_sessions,
     rollout,
 )
-from nfriction.evaluation.sessions import random_effects
+from nfriction.evaluation import sessions as sessions_module
+from nfriction.evaluation.sessions import SessionFit, random_effects
 from nfriction.friction.memory import Dahl
 
 COUNT = 2 * math.pi / 8192
@@ -52,7 +53,7 @@ def test_mean_and_spread_between_sessions_are_recovered(tmp_path):
 
 
 def test_failed_session_is_listed(tmp_path):
-    sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(3)}
+    sessions = {f"day {k}": session(np.array([0.02 + 1e-3 * k, 0.006])) for k in range(3)}
     sessions["lost"] = tmp_path / "missing.csv"
     found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5,), drag=False)
     assert "missing.csv" in found.failed["lost"]
@@ -127,7 +128,7 @@ def test_fixed_coefficients_are_kept_in_the_mean_model():
 
 
 def test_session_with_an_unusable_fit_is_excluded():
-    sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(4)}
+    sessions = {f"day {k}": session(np.array([0.02 + 1e-3 * k, 0.006])) for k in range(4)}
     sound = sessions["day 1"]
     # With reversed time, the motion gains energy.
     sessions["day 1"] = Recording(sound.time, sound.q[::-1], convention=sound.convention)
@@ -136,3 +137,39 @@ def test_session_with_an_unusable_fit_is_excluded():
     assert found.failed["day 1"].startswith("do not use: ")
     assert {one.usability[0] for one in found.fits.values()} == {"good"}
     assert found.spreads[0].sessions == 3
+
+
+def estimates(values: dict[str, float]) -> SessionFit:
+    return SessionFit(values, dict.fromkeys(values, 0.1), 1e-4, "", ("good", ""), (), 1e-3)
+
+
+@pytest.mark.parametrize("first", [0, 1, 4])
+def test_terms_are_summarised_over_sessions_that_have_them(monkeypatch, first):
+    some = {"F_c of joint1": 1.0, "F_v of joint1": 2.0}
+    given = {"a": some | {"inertia": 1.0}, **dict.fromkeys("bcd", some), "e": some | {"drag": 3.0}}
+    order = [*given][first:] + [*given][:first]
+    monkeypatch.setattr(sessions_module, "_read", lambda *_: iter(()))
+    monkeypatch.setattr(sessions_module, "_fit_session", lambda *a: estimates(given[a[2]]))
+    found = fit_sessions("coulomb-viscous", PLANT, {k: k for k in order})
+    counts = {s.name: s.sessions for s in found.spreads}
+    assert counts == {**dict.fromkeys(some, 5), "inertia": 1, "drag": 1}
+    assert found.model.schedule.parameter_vector().tolist() == pytest.approx([1.0, 2.0])
+    assert found.model.v_smooth == 1e-3
+
+
+def test_recording_of_several_sessions_is_refused():
+    one = session(np.array([0.02, 0.006]))
+    with pytest.raises(ValueError, match=r"1 \(session a\) and 2 \(session b\) contain the same"):
+        fit_sessions(CVFM(1), PLANT, dict.fromkeys("abc", one))
+
+
+def test_ctrl_c_keeps_the_sessions_that_were_fitted(monkeypatch):
+    def fitted(*arguments):
+        if arguments[2] == "d":
+            raise KeyboardInterrupt
+        return estimates({"F_c of joint1": 1.0, "F_v of joint1": 2.0})
+
+    monkeypatch.setattr(sessions_module, "_read", lambda *_: iter(()))
+    monkeypatch.setattr(sessions_module, "_fit_session", fitted)
+    found = fit_sessions(CVFM(1), PLANT, {k: k for k in "abcd"})
+    assert found.failed == {"d": "interrupted"}

@@ -135,23 +135,24 @@ def as_recording_list(
 ) -> list[Recording]:
     """The recordings of a fit as a list; raises if one is no recording or given twice."""
     given = Recording.many(recordings, plant=plant)
-    _refuse_repeated(given)
+    refuse_repeated(given)
     warn_of_undriven(given)
     return given
 
 
-def _refuse_repeated(recordings: Sequence[Recording]) -> None:
+def refuse_repeated(recordings: Iterable[Recording]) -> None:
     """Refuse the same data twice, under any name, because that would narrow intervals."""
-    first: dict[str, int] = {}
-    # Several blocks of a recording may contain the same rest.
-    moving = [(k, r) for k, r in enumerate(recordings) if np.ptp(r.q, axis=0).any()]
-    for k, recording in moving:
-        before = first.setdefault(recording.digest(), k)
-        if before != k:
-            names = (recordings[before].name or "unnamed", recording.name or "unnamed")
+    first: dict[str, tuple[int, str]] = {}
+    for k, recording in enumerate(recordings, 1):
+        # Several blocks of a recording may contain the same rest.
+        if not np.ptp(recording.q, axis=0).any():
+            continue
+        name = recording.name or "unnamed"
+        before = first.setdefault(recording.digest(), (k, name))
+        if before[0] != k:
             raise ValueError(
-                f"a recording can be given only once, but recordings {before + 1} ({names[0]}) and "
-                f"{k + 1} ({names[1]}) contain the same data; leave one out."
+                f"a recording can be given only once, but recordings {before[0]} ({before[1]}) and "
+                f"{k} ({name}) contain the same data; leave one out."
             )
 
 
