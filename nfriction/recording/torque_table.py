@@ -102,21 +102,24 @@ class JointTorque:
 
     @property
     def distinct(self) -> JointTorque:
-        """Rows in no order without copies of the whole table, which would narrow intervals.
+        """Rows without time by velocity, without copies of the whole table.
 
-        Readings of a coarse sensor are equal by chance, but then not each a multiple of k times.
+        Copies would narrow intervals. Readings of a coarse sensor are equal by chance, but then not
+        each a multiple of k times. The order of rows in the file does not matter; those at one
+        velocity are shuffled, because in order of their torque they would seem correlated.
         """
         if self.time is not None:
             return self
-        every = (self.q, self.qd, self.qdd, self.load, self.temperature, self.tau)
+        every = (self.qd, self.tau, self.q, self.qdd, self.load, self.temperature)
         table = np.stack([x for x in every if x is not None], 1)
         _, where, counts = np.unique(table, axis=0, return_inverse=True, return_counts=True)
         kept = counts // np.gcd.reduce(counts)
         if kept.sum() < MINIMUM_ROWS:
-            return self
-        order = np.argsort(where.ravel(), kind="stable")
+            kept = counts
         repeat = np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)
-        return self.rows(np.sort(order[repeat < np.repeat(kept, counts)]))
+        order = np.argsort(where.ravel(), kind="stable")[repeat < np.repeat(kept, counts)]
+        order = np.random.default_rng(0).permutation(order)
+        return self.rows(order[np.argsort(self.qd[order], kind="stable")])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

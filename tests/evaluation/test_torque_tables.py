@@ -473,3 +473,16 @@ def test_memory_and_load_must_improve_by_more_than_the_block_scatter() -> None:
     assert _choose([plain])[1] == "the only model"
     assert _choose([loaded, steady, plain])[0] == "Slip"
     assert _choose([steady, plain])[1] == "47 % less than coulomb-viscous"
+
+
+def test_order_of_rows_without_time_does_not_matter() -> None:
+    rng = np.random.default_rng(0)
+    qd = np.repeat(np.r_[-np.linspace(2, 0.05, 20), np.linspace(0.05, 2, 20)], 3)
+    tau = np.sign(qd) * (0.5 + 0.3 * np.exp(-((qd / 0.2) ** 2))) + 0.1 * qd
+    table = pd.DataFrame({"qd": qd, "tau": tau + 0.01 * rng.standard_normal(len(qd))})
+    one, other = (
+        fit_torque(t, "coulomb-viscous") for t in (table, table.sample(frac=1, random_state=0))
+    )
+    pd.testing.assert_frame_equal(one.intervals(), other.intervals(), rtol=1e-12)
+    # Of a wrong law, errors of neighbouring velocities are alike.
+    assert one.intervals()["high"].iloc[0] - one.intervals()["value"].iloc[0] > 0.03
