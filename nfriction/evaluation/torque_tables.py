@@ -348,10 +348,19 @@ def fit_torque(
     remarks += _signed_loads(given, fits)
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):
-        shown = _shown(given.joints[k], of)
-        name, why = _choose(shown)
+        speeds = _speeds(given.joints[k])
+        shown = _determined(len(speeds), of)
+        name, why = _choose(shown or of)
         hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
-        why += f"; measure at more speeds to judge {hidden}" * bool(hidden)
+        if not shown:
+            listed = ", ".join(f"{x:.3g}" for x in speeds)
+            alike = "dry and viscous friction" if len(speeds) == 1 else "several laws"
+            remarks.append(
+                f"{joint} moves at {listed} {given.unit}/s only, where {alike} cannot be "
+                f"distinguished; measure at more speeds to judge {hidden}."
+            )
+        elif hidden:
+            why += f"; measure at more speeds to judge {hidden}"
         choices[joint] = name, f"{why}{fits[name][k].note}"
         remarks += _useless(given.joints[k], next(c for c in of if c.name == name))
         remarks += _doubts(given.joints[k], fits[name][k].model, given.unit)
@@ -548,15 +557,20 @@ def _left_out(error: Array, cause: Array, parts: Sequence[NDArray[np.intp]]) -> 
     ])  # fmt: skip
 
 
-def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Models whose law has fewer fitted coefficients than the joint has speeds; all if none has.
+def _speeds(joint: JointTorque) -> list[float]:
+    """Distinct speeds of a joint [rad/s; m/s], increasing."""
+    found: list[float] = []
+    for speed in np.sort(np.abs(joint.qd)).tolist():
+        if speed > (1 + SAME_SPEED) * (found[-1] if found else 0.0):
+            found.append(speed)
+    return found
+
+
+def _determined(count: int, candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Models whose law has fewer fitted coefficients than this number of speeds.
 
     Any other passes through the mean torque of every speed, and repeats show only the noise.
     """
-    count, last = 0, 0.0
-    for speed in np.sort(np.abs(joint.qd)).tolist():
-        if speed > (1 + SAME_SPEED) * last:
-            count, last = count + 1, speed
     found = []
     for candidate in candidates:
         model = model_by_name(candidate.name)(1)
@@ -564,7 +578,7 @@ def _shown(joint: JointTorque, candidates: Sequence[Candidate]) -> Sequence[Cand
         more = model.law.memory or torque_table.reads_load(model)
         if more or sum(c.fitted for c in model.law.coefficients) < count:
             found.append(candidate)
-    return found or candidates
+    return found
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:

@@ -486,3 +486,12 @@ def test_order_of_rows_without_time_does_not_matter() -> None:
     pd.testing.assert_frame_equal(one.intervals(), other.intervals(), rtol=1e-12)
     # Of a wrong law, errors of neighbouring velocities are alike.
     assert one.intervals()["high"].iloc[0] - one.intervals()["value"].iloc[0] > 0.03
+
+
+@pytest.mark.parametrize("jitter", [0.0, 2e-3])
+def test_table_at_one_speed_does_not_tell_dry_from_viscous(jitter: float) -> None:
+    rng = np.random.default_rng(0)
+    qd = np.repeat([-1.0, 1.0], 10) * (1 + jitter * rng.standard_normal(20))
+    tau = 0.3 * np.sign(qd) + 0.01 * rng.standard_normal(20)
+    found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "viscous,coulomb")
+    assert "rad/s only, where dry and viscous friction cannot be" in found.table.remarks[-1]
