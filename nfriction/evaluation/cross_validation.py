@@ -263,8 +263,11 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     )
 
 
-def indistinguishable(one: Candidate, best: Candidate) -> bool:
-    """True if two errors differ by no more than their scatter over the blocks explains."""
-    squares = np.square([best.errors, one.errors]).clip(min=DEFAULTS.min_noise**2)
+def indistinguishable(one: Candidate, best: Candidate, least: float = DEFAULTS.min_noise) -> bool:
+    """True if two errors differ by no more than their scatter over the blocks explains.
+
+    Errors of less than `least` [unit of the errors] are alike.
+    """
+    squares = np.square([best.errors, one.errors]).clip(min=least**2)
     new, old = torch.from_numpy(squares)
     return not improves(new, old, least=1 + TOLERANCE)

@@ -51,6 +51,8 @@ WITH_BOTH = ("load-slip",)
 FENCE = 3.0
 # Errors below this part of the median torque do not matter.
 SMALL = 0.01
+# Share of the largest torque that no sensor of 20 bits resolves.
+UNRESOLVED = 1e-6
 # Share of the largest load up to which a negative one is noise of an unloaded sensor.
 NO_LOAD = 0.1
 # Rows far off are single mistakes up to this share, or number, which are listed.
@@ -350,7 +352,7 @@ def fit_torque(
     for k, (joint, of) in enumerate(errors.items()):
         speeds = _speeds(given.joints[k])
         shown = _determined(len(speeds), of)
-        name, why = _choose(shown or of)
+        name, why = _choose(shown or of, UNRESOLVED * float(np.abs(given.joints[k].tau).max()))
         hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
         if not shown:
             listed = ", ".join(f"{x:.3g}" for x in speeds)
@@ -581,8 +583,8 @@ def _determined(count: int, candidates: Sequence[Candidate]) -> list[Candidate]:
     return found
 
 
-def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
-    """The model to use and the reason.
+def _choose(candidates: Sequence[Candidate], least: float = 0.0) -> tuple[str, str]:
+    """The model to use and the reason; errors of less than `least` [N m; N] are alike.
 
     A law that needs memory, or a load, has to beat the choice among laws that need less by more
     than chance explains over the blocks, by the rules for networks and for their inputs, because
@@ -594,12 +596,12 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
         need = kind.definition.memory is not None, torque_table.reads_load(kind(1))
         by_need.setdefault(need, []).append(candidate)
     first, *others = sorted(by_need)
-    chosen, why = _simplest(by_need[first])
+    chosen, why = _simplest(by_need[first], least)
     if others and len(by_need[first]) == 1:
         why = "no other needs as little memory or load"
     for need in others:
         more = by_need[need]
-        best, reason = _simplest(more)
+        best, reason = _simplest(more, least)
         new, old = torch.from_numpy(np.square([best.errors, chosen.errors]))
         if improves(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
             chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
@@ -614,10 +616,10 @@ def _percent(more: Candidate, less: Candidate) -> str:
     return f"{100 * (1 - less.error / more.error):.0f}"
 
 
-def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
+def _simplest(candidates: Sequence[Candidate], resolved: float) -> tuple[Candidate, str]:
     """The model with fewest parameters whose error chance may raise above the least, and why."""
     least = min(candidates, key=lambda c: c.error)
-    near = [c for c in candidates if c is least or indistinguishable(c, least)]
+    near = [c for c in candidates if c is least or indistinguishable(c, least, resolved)]
     # A dropped network equals its law but for rounding: then the law.
     chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:

@@ -495,3 +495,11 @@ def test_table_at_one_speed_does_not_tell_dry_from_viscous(jitter: float) -> Non
     tau = 0.3 * np.sign(qd) + 0.01 * rng.standard_normal(20)
     found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "viscous,coulomb")
     assert "rad/s only, where dry and viscous friction cannot be" in found.table.remarks[-1]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-8])
+def test_choice_of_a_law_does_not_depend_on_the_unit_of_torque(unit: float) -> None:
+    qd = np.linspace(-1, 1, 40)
+    table = pd.DataFrame({"qd": qd, "tau": unit * (0.3 * np.sign(qd) + 0.2 * qd)})
+    found = fit_torque(table, "coulomb,coulomb-viscous,stribeck", folds=4)
+    assert found.chosen == {"joint1": "CVFM"}
