@@ -112,6 +112,22 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         lock.release()
 
 
+@contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """A folder for the files of a run, which replace those of an earlier run after the block.
+
+    Among them must be a `results.json` that lists them as `files`. After an error nothing changes.
+    """
+    unfinished = folder / UNFINISHED
+    with exclusive(folder):
+        try:
+            yield unfinished
+            unfinished.rename(folder / COMPLETE)
+            _put_in_place(folder)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+
+
 def write_results(
     comparison: Comparison,
     train: Sequence[Recording],
@@ -147,14 +163,13 @@ def write_results(
     content = json.dumps([results, parameters], sort_keys=True)
     run = hashlib.sha256(content.encode()).hexdigest()[:16]
     results |= {"run": run, "command": command}
-    unfinished = folder / UNFINISHED
 
     def write_index(place: Path, files: Sequence[str]) -> None:
         text = json.dumps(checked_json(results | {"files": sorted(files)}), indent=1)
         write_atomically(place / RESULTS, text.encode())
 
     with exclusive(folder):
-        try:
+        with replacing(folder) as unfinished:
             write_atomically(unfinished / TABLE, _table(comparison, run).encode())
             written = [TABLE]
             for name, fit in comparison.fits.items():
@@ -168,12 +183,11 @@ def write_results(
                     logger.warning("%s was not exported: %s", name, " ".join(str(error).split()))
                 written += [f"models/{path.name}" for path in paths]
             write_index(unfinished, written)
-            unfinished.rename(folder / COMPLETE)
-            _put_in_place(folder)
-            # Drawn after the fits are saved, because drawing takes long and may be interrupted.
-            if figures:
-                from nfriction import plots  # matplotlib takes half a second that others save
+        # Drawn after the fits are saved, because drawing takes long and may be interrupted.
+        if figures:
+            from nfriction import plots  # matplotlib takes half a second that others save
 
+            try:
                 drawn = plots.save_all(
                     comparison, [*train, *test], unfinished, run=run, formats=formats
                 )
@@ -183,8 +197,8 @@ def write_results(
                 write_index(folder, written)
                 for path in drawn:
                     path.replace(folder / "figures" / path.name)
-        finally:
-            shutil.rmtree(unfinished, ignore_errors=True)
+            finally:
+                shutil.rmtree(unfinished, ignore_errors=True)
     return [folder / RESULTS, *(folder / name for name in written)]
 
 

@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from nfriction.evaluation.results import REPORT, RESULTS, TABLE, exclusive
+from nfriction.evaluation.results import REPORT, RESULTS, TABLE, replacing
 from nfriction.evaluation.tables import Table, Value
 from nfriction.evaluation.torque_tables import TorqueFits
 from nfriction.friction import plain_name
@@ -58,31 +58,34 @@ def write_torque_fits(
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models, a figure and `report.html` into a folder.
 
-    The folder is made if necessary, and files of these names are replaced; `command` is the command
-    line that reproduces the results.
+    As with `write_results`, they replace those of an earlier run, and the user's own files stay;
+    `command` is the command line that reproduces the results.
+
+    Raises:
+        OSError: another process is writing a run into the folder, or it cannot be written.
     """
     folder = Path(folder)
-    written, drawn = [], []
-    with exclusive(folder):
+    written, drawn = [TABLE], []
+    with replacing(folder) as new:
         text = fits.to_frame().rename(columns=plain_name).to_csv()
-        written.append(write_atomically(folder / TABLE, text.encode()))
+        write_atomically(new / TABLE, text.encode())
         for name in fits.fits:
-            path = folder / "models" / f"{name}.json"
-            written.append(save(fits.model(name), path, fits.info(name)))
+            written.append(f"models/{name}.json")
+            save(fits.model(name), new / written[-1], fits.info(name))
         if figures:
-            (folder / "figures").mkdir(exist_ok=True)
             figure = fits.plot()
             width, height = (round(DPI * x) for x in figure.get_size_inches())
-            path = folder / "figures" / f"{FIGURE}.png"
+            written.append(f"figures/{FIGURE}.png")
+            path = new / written[-1]
+            path.parent.mkdir()
             figure.savefig(path, dpi=DPI)
             drawn.append(Figure(FIGURE, path.read_bytes(), width, height))
-            written.append(path)
         page = to_html(fits, folder, drawn, command)
-        written.append(write_atomically(folder / REPORT, page.encode(errors="backslashreplace")))
-        results = fits.to_dict() | {"command": command}
+        write_atomically(new / REPORT, page.encode(errors="backslashreplace"))
+        results = fits.to_dict() | {"command": command, "files": sorted(written)}
         text = json.dumps(results, indent=1, allow_nan=False)
-        written.append(write_atomically(folder / RESULTS, text.encode()))
-    return written
+        write_atomically(new / RESULTS, text.encode())
+    return [folder / name for name in (*written, REPORT, RESULTS)]
 
 
 def to_html(fits: TorqueFits, folder: Path, figures: list[Figure], command: str) -> str:

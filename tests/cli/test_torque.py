@@ -4,9 +4,12 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from nfriction.cli import main
+from nfriction.evaluation.torque_tables import fit_torque
+from nfriction.report.torque import write_torque_fits
 
 
 @pytest.fixture
@@ -51,6 +54,21 @@ def test_a_table_is_fitted_scored_and_exported(
     assert main(["info", file]) == 0
     assert "coulomb-viscous" in capsys.readouterr().out
     assert main(["export", file, "--format", "torchscript", "--out", str(tmp_path)]) == 0
+
+
+def test_second_run_removes_files_of_the_first_in_its_folder(tmp_path: Path) -> None:
+    qd = np.linspace(-1, 1, 40)
+    table = pd.DataFrame({"qd": qd, "tau": 0.3 * np.sign(qd) + 0.2 * qd})
+    write_torque_fits(fit_torque(table, "viscous,coulomb", folds=2), tmp_path, figures=False)
+    # Of the user, and as `compare` writes beside each model.
+    index = json.loads((tmp_path / "results.json").read_text())
+    for name in ("notes.txt", "models/CFM.pt"):
+        (tmp_path / name).touch()
+        index["files"].append(name)
+    (tmp_path / "results.json").write_text(json.dumps(index))
+    write_torque_fits(fit_torque(table, "viscous", folds=2), tmp_path, figures=False)
+    found = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*.*")}
+    assert found == {"models/NCFM.json", "notes.txt", "report.html", "results.json", "table.csv"}
 
 
 def test_errors_are_one_line_with_the_remedy(
