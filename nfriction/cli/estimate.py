@@ -109,7 +109,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     usable = found.converged and found.usability[0] != "do not use"
     if usable and _has_controller(found.model, info):
         further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
-        print(f"next: {shlex.join(further)}")
+        print(f"next: {shlex.join(further + inputs.law_words(found.model.law.name))}")
     return 0
 
 
@@ -209,6 +209,7 @@ def _print(
         print(f"all figures on a page: {shlex.join(['nfriction', 'report', str(arguments.out)])}")
         if best is not None and _has_controller(best.model, model_info(best, train)):
             export = ["nfriction", "export", str(model), "--format", "c", "--out", "controller"]
+            export += inputs.law_words(best.model.law.name)
             print(f"this model as C code:  {shlex.join(export)}")
 
 

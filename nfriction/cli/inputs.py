@@ -43,6 +43,8 @@ _FIT_OPTIONS = (
 
 # `my.py:LAW`, alone or after the kind of its coefficients.
 _OWN_LAW = re.compile(r"(?P<kind>neuro-fuzzy:|adaptive:|)(?P<file>.+\.py):(?P<law>\w+)")
+# FILE.py:LAW by the name of the law.
+_SOURCES: dict[str, str] = {}
 
 
 def model(text: str) -> str:
@@ -87,9 +89,16 @@ def law(text: str) -> str:
             f"{path} has no law {own['law']}; its laws: {laws or 'none'}"
         )
     try:
-        return add_law(found)
+        name = add_law(found)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error).rstrip(".")) from None
+    _SOURCES[found.name] = text.strip()
+    return name
+
+
+def law_words(name: str) -> list[str]:
+    """Words of a command line that name the file of a law; none for a law of this package."""
+    return ["--law", _SOURCES[name]] if name in _SOURCES else []
 
 
 def rig(text: str) -> str:

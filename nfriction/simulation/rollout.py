@@ -89,6 +89,7 @@ def rollout(
         the motion is NaN from `diverged_at` on.
 
     Raises:
+        TypeError: if plant or friction has another type.
         ValueError: if shapes do not fit, inputs are not finite, friction is too steep at rest for
             a stable integration, or the scheme does not support an option.
         CodegenError: if `backend="compiled"` and the model cannot be compiled.

@@ -80,6 +80,12 @@ def validate_inputs(
     substeps: int,
 ) -> RolloutInputs:
     """Initial state, torque and sample times as tensors of matching shape."""
+    for name, given, kind, method in (
+        ("plant", plant, "mechanism", "forward_dynamics"),
+        ("friction", friction, "friction model or None", "coefficients"),
+    ):
+        if not hasattr(given, method):
+            raise TypeError(f"`{name}` must be a {kind}, got {type(given).__name__}.")
     for name, whole in (("steps", 1 if steps is None else steps), ("substeps", substeps)):
         if not isinstance(whole, Integral) or whole < 1:
             raise ValueError(f"`{name}` must be a whole number of at least 1, got {whole!r}.")

@@ -237,6 +237,13 @@ def test_user_defined_law_works_from_fit_to_export(
     ]
 
 
+def test_file_of_a_law_is_part_of_printed_commands(own_law: Path) -> None:
+    for name in inputs.models(f"{own_law}:STICKY,neuro-fuzzy:{own_law}:STICKY"):
+        words = inputs.law_words(friction.model_by_name(name)(1).law.name)
+        assert words == ["--law", f"{own_law}:STICKY"]
+    assert inputs.law_words("CVFM") == []
+
+
 @pytest.mark.parametrize(
     ("law", "message"),
     [

@@ -588,3 +588,10 @@ def test_bad_input_is_refused_with_the_rule(settings, message):
     given = {"model": smooth_model()} | settings
     with pytest.raises(ValueError, match=message):
         run(**given)
+
+
+def test_plant_and_friction_in_the_wrong_place_are_named() -> None:
+    with pytest.raises(TypeError, match=r"`plant` must be a mechanism, got LFM\."):
+        rollout(LFM(2), CHAIN, Q0, QD0, steps=1)
+    with pytest.raises(TypeError, match=r"`friction` must be a friction model or None, got Pend"):
+        rollout(CHAIN, CHAIN, Q0, QD0, steps=1)
