@@ -347,6 +347,12 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join([*remarks, *failed.values()]))
+    heated = any(joint.temperature is not None for joint in given.joints)
+    if heated and not any(isinstance(of[0].model.schedule, Recorded) for of in fits.values()):
+        remarks.append(
+            "The column temperature is not used: only neuro-fuzzy:slip follows it, for rows in "
+            "order of time."
+        )
     remarks += _signed_loads(given, fits)
     choices = {}
     for k, (joint, of) in enumerate(errors.items()):

@@ -48,6 +48,8 @@ MINIMUM_ROWS = 8
 FAST = 60.0
 # Positions follow the velocity within this factor: units differ by more, filters by less.
 FOLLOWS = 2.0
+# Number of unread columns that are named.
+LISTED = 8
 # Share of the largest velocity up to which a joint is at rest.
 RESTING = 1e-3
 
@@ -223,9 +225,13 @@ class TorqueTable:
             if key[0] != "joint"
         }
         remarks: list[str] = []
+        read = {column for column, _ in sources.values()}
+        if unread := [name[:60] for name in table.columns if name not in read]:
+            more = f" and {len(unread) - LISTED} more" * (len(unread) > LISTED)
+            remarks.append(f"Columns that are not read: {', '.join(unread[:LISTED])}{more}.")
         if torque and ("time", 0) in sources:
             # Without time, equal rows need not be copies: `JointTorque.distinct` judges.
-            first = ~table.duplicated([column for column, _ in sources.values()]).to_numpy()
+            first = ~table.duplicated(list(read)).to_numpy()
             if copies := int((~first).sum()):
                 remarks.append(
                     f"{copies} of {len(table)} rows equal others in every column, time included, "

@@ -503,3 +503,10 @@ def test_choice_of_a_law_does_not_depend_on_the_unit_of_torque(unit: float) -> N
     table = pd.DataFrame({"qd": qd, "tau": unit * (0.3 * np.sign(qd) + 0.2 * qd)})
     found = fit_torque(table, "coulomb,coulomb-viscous,stribeck", folds=4)
     assert found.chosen == {"joint1": "CVFM"}
+
+
+def test_columns_that_no_law_reads_are_named() -> None:
+    table = speeds(1).drop(columns="time").assign(temperature=20.0, voltage=1.0)
+    remarks = fit_torque(table, "coulomb-viscous").table.remarks
+    assert "Columns that are not read: voltage." in remarks
+    assert any(text.startswith("The column temperature is not used") for text in remarks)
