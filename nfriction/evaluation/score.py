@@ -99,10 +99,13 @@ class Score(Errors):
     simulated: Array = field(repr=False)
     diverged_at: float
     zero: tuple[float, ...] | None = None
+    unit: str = "rad; m"  # of the errors
 
     def __str__(self) -> str:
         limit = "" if self.limit is None else f"; limit of these data: {self.limit}"
-        return f"RMSE [rad; m] of {self.recording or 'a recording'}: {super().__str__()}{limit}"
+        return (
+            f"RMSE [{self.unit}] of {self.recording or 'a recording'}: {super().__str__()}{limit}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -176,7 +179,7 @@ def score(
         whole.time,
         simulated,
         min(run.diverged_at for run in runs),
-        None if zero is None else tuple(zero.offset.tolist()),
+        None if zero is None else tuple(zero.offset.tolist()), plant.unit,
     )  # fmt: skip
 
 

@@ -610,11 +610,12 @@ def _choose(candidates: Sequence[Candidate], least: float = 0.0) -> tuple[str, s
         best, reason = _simplest(more, least)
         new, old = torch.from_numpy(np.square([best.errors, chosen.errors]))
         if improves(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
-            chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
+            gain = f"hold-out error {_percent(chosen, best)} % smaller"
+            chosen, why = best, f"{gain} than that of {plain_name(chosen.name)}"
             why += f"; {reason}" * (len(more) > 1)
         elif best.error < chosen.error:
-            gain = f"{plain_name(best.name)} has {_percent(chosen, best)} % less"
-            why += f"; {gain}, which the blocks' scatter explains"
+            gain = f"{plain_name(best.name)} is {_percent(chosen, best)} % smaller"
+            why += f"; the hold-out error of {gain}, which the blocks' scatter explains"
     return chosen.name, why
 
 
@@ -639,7 +640,7 @@ def _simplest(candidates: Sequence[Candidate], resolved: float) -> tuple[Candida
         return least, "the only model"
     second = min(others, key=lambda c: c.error)
     more = 100 * (second.error / least.error - 1)
-    return least, f"{plain_name(second.name)} has {more:.0f} % more"
+    return least, f"the hold-out error of {plain_name(second.name)} is {more:.0f} % larger"
 
 
 def _fit(

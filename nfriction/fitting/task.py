@@ -167,7 +167,7 @@ def prepare_task(
         model, plant, joint, measurement, moved, options, start, callback, per_recording, delay,
         found, doubted + tuple(m.text for m in mistakes), tuple(drift),
         (() if doubted else corrected) + tuple(unmodelled),
-        (inputs.SMOOTHED.format(floor, wanted),) * blurred,
+        (inputs.SMOOTHED.format(floor, wanted, plant.unit),) * blurred,
         first.ratios if first is not None and corrected else {},
     )  # fmt: skip
 

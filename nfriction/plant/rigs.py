@@ -365,7 +365,12 @@ def _are_numbers(value: Any, depth: int = 0) -> bool:
 
 def _parse(text: str, suffix: str) -> Any:
     if suffix == ".json":
-        return parse_json(text)
+        try:
+            return parse_json(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(
+                f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}"
+            ) from error
     if suffix != ".toml":
         raise ValueError(f"a rig file ends in .json or .toml, .urdf or .xml, not {suffix!r}.")
     if sys.version_info < (3, 11):

@@ -60,7 +60,7 @@ def test_score_is_printed_in_one_line():
         errors.free_run, errors.windows, errors, "run3", np.zeros(1), np.zeros(1), np.inf
     )
     assert str(scored) == f"RMSE [rad; m] of run3: {values}; limit of these data: {values}"
-    assert str(replace(scored, limit=None)) == f"RMSE [rad; m] of run3: {values}"
+    assert str(replace(scored, limit=None, unit="m")) == f"RMSE [m] of run3: {values}"
 
 
 def test_simulations_restart_after_a_gap():

@@ -467,12 +467,12 @@ def test_memory_and_load_must_improve_by_more_than_the_block_scatter() -> None:
     name, why = _choose([plain, once])
     assert name == "CVFM"
     assert why == (
-        "no other needs as little memory or load; slip has 12 % less, which the blocks' scatter "
-        "explains"
+        "no other needs as little memory or load; the hold-out error of slip is 12 % smaller, "
+        "which the blocks' scatter explains"
     )
     assert _choose([plain])[1] == "the only model"
     assert _choose([loaded, steady, plain])[0] == "Slip"
-    assert _choose([steady, plain])[1] == "47 % less than coulomb-viscous"
+    assert _choose([steady, plain])[1] == "hold-out error 47 % smaller than that of coulomb-viscous"
 
 
 def test_order_of_rows_without_time_does_not_matter() -> None:

@@ -224,6 +224,8 @@ def test_status_reports_clamping_and_saturation(exported):
 def test_the_filter_runs_inside(exported, name, dtype):
     _, controller, folder = exported(name, dtype, with_filter=True)
     build([*C89, "-c", "nfriction.c", "-o", "n.o"], folder)
+    header = (folder / "nfriction.h").read_text()
+    assert " * Filter: second-order low-pass, cut-off 20 Hz, damping " in header
     build([*CXX, "-fsyntax-only", "-x", "c++", "nfriction.c"], folder)
     self_test(folder, "-O2")
     self_test(folder, "-O3", "-ffast-math")

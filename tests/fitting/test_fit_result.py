@@ -9,6 +9,7 @@ from nfriction import FrictionModel, LinearAxis
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
+from nfriction.fitting.result.of_search import _one_way
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CVFM, LFM, NCFM, Stribeck
@@ -144,3 +145,10 @@ def test_residual_larger_than_the_motion_is_doubtful(found: FitResult) -> None:
         verdict, reason = replace(found, motions=motions, noise=noise, residual=1e-3).usability
         assert verdict == "doubtful"
         assert "the residual is larger than the motion" in reason
+
+
+def test_remedy_of_a_constant_torque_has_no_minus_sign() -> None:
+    for value, remedy in ((0.1, "subtract 0.1 N from a command"), (-0.1, "add 0.1 N to a command")):
+        assert remedy in _one_way(
+            LinearAxis(1.0), 0, constant=True, value=value, largest=torch.ones(1)
+        )

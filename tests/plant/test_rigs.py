@@ -120,7 +120,7 @@ def write(path: Path, text: str) -> Path:
         ('{"kind": "axis"}', r"missing keys \['mass'\]"),
         ('{"mass": [1], "length": [1], "buffers": {"friction": [1]}}', "no buffer `friction`"),
         ("[1, 2]", "one table"),
-        ('{"mass": ', "rig.json"),
+        ('{"mass": ', "rig.json: not valid JSON: Expecting value at line 1, column 1"),
     ],
 )
 def test_bad_rig_files_raise_clear_errors(text: str, message: str, tmp_path: Path) -> None:

@@ -30,7 +30,8 @@
  * NaN or infinity gives NaN for that joint (NOT_FINITE), also under -ffast-math.
  * SATURATED: the torque limit.
  * Torque limit: {{ "none" if about.torque_limit is none else safe(about.torque_limit) }}.
- * Filter: {{ "none" if about.filter is none else safe(about.filter) }}.
+ * Filter: {% if about.filter %}second-order low-pass, cut-off {{ "%.6g Hz, damping %.6g, sample time %.9g s" %
+    (about.filter.cutoff_hz, about.filter.damping, about.filter.sample_time) }}{% else %}none{% endif %}.
  * Parameters: {{ safe(about.parameter_hash) }}.
 {% for name, value in about.training_data | dictsort %}
  * Training data: {{ safe(name) }}: {{ safe(value) }}

@@ -400,9 +400,10 @@ ZEROED_PER_RECORDING = (
     'scored. If this is wrong: `encoder_reference="shared"`.'
 )
 SMOOTHED = (
-    "Dry friction is smoothed over velocities of ±{:.2g} instead of ±{:.2g}, because a steeper "
-    "sign needs more integration steps than a fit takes; this may cause errors above the noise. A "
-    "model with a smaller `v_smooth`, or recordings with a higher sample rate, avoid them."
+    "Dry friction is smoothed over velocities of ±{:.2g} instead of ±{:.2g} {}/s, because a "
+    "steeper sign needs more integration steps than a fit takes; this may cause errors above the "
+    "noise. A model with a smaller `v_smooth`, or recordings with a higher sample rate, avoid "
+    "them."
 )
 COARSE = (
     "Near rest a sample needs {} integration steps, fits take {}, so motion there is approximate; "

@@ -344,7 +344,8 @@ def _one_way(plant: Plant, joint: int, constant: bool, value: float, largest: Te
     cause = f"may equally be friction that is {2 * abs(value):.3g} {unit} larger {way}"
     if constant and abs(value) > largest[joint]:
         cause = "is larger than its friction: a weight, a spring, or a sensor's bias"
-    remedy = f"add {-value:.3g} {unit} to a command"
+    sign = "subtract {} from" if value > 0 else "add {} to"
+    remedy = f"{sign.format(f'{abs(value):.3g} {unit}')} a command"
     if constant:
         remedy += ", but not if it is a sensor's bias"
     return (
