@@ -103,8 +103,12 @@ class _Rollout(torch.autograd.Function):
         return states
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # `create_graph`; without an error, a Hessian would be zero
+            raise RuntimeError(
+                "gradients of a rollout are of first order only; for a Hessian or `create_graph` "
+                'use `rollout(..., backend="torch")`.'
+            )
         # Unpacking refuses tensors that were changed in place since the forward pass.
         q, qd, qdd, q0, _, tau, *_ = ctx.saved_tensors
         sweep = _Sweep(ctx.system, q.shape[:-2])

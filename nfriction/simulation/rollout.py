@@ -81,7 +81,7 @@ def rollout(
             not `"compiled"`, and there are at most 10,000 steps.
         backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition (no
             gradients); `"auto"` compiles if possible. Its gradients come from an adjoint sweep, of
-            first order only; for higher ones, or in `torch.func`, `"torch"` records every step.
+            first order only; for higher ones `"torch"` records every step.
         threads: number of threads that share a compiled batch.
 
     Returns:

@@ -174,6 +174,22 @@ def test_chunks_give_equal_results_and_open_parameters_infinite_sd():
     assert sd[0].tolist() == [[1.0, 1.0], [1.0, torch.inf]]
 
 
+def test_intervals_do_not_depend_on_the_unit_of_length():
+    """The first noise is a guess in metres, too; if too large, priors outweigh the data."""
+    time = 2e-3 * np.arange(751)
+    tau = 0.3 * np.sin(5 * time) + 0.15 * np.sin(14 * time)
+    true, widths = CVFM(1, [0.05, 0.02], v_smooth=0.05).requires_grad_(False), []
+    run = rollout(LinearAxis(0.02), true, [0.3], [0.0], tau[:-1, None], sample_time=2e-3)
+    for unit in (1.0, 1e-3):
+        q, force = unit * quantise(run.q.numpy(), 8192), unit * tau[:, None]
+        recording = Recording(time, q, tau=force, unit="m")
+        model = CVFM(1, v_smooth=0.05 * unit)
+        found = fit(model, LinearAxis(0.02), recording, windows=(0.5,), drag=False)
+        (dry, viscous), scale = found.intervals[:2], (unit, 1.0)
+        widths.append([(i.high - i.low) / k for i, k in zip((dry, viscous), scale, strict=True)])
+    np.testing.assert_allclose(*widths, rtol=0.2)
+
+
 def test_uncertainty_of_constants_equals_the_intervals(fits):
     law, _ = fits
     rest = torch.zeros(1, dtype=F64)

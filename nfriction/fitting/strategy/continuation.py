@@ -325,11 +325,14 @@ def horizon_continuation(
             break
         simulated = found.problem.simulated_motions(found.result.x, simulated)
     end = stages[-1]
-    if skipped and end.result.status == "max_steps":
-        # The step limit ended a stage that was only to start the next one.
-        tolerance = loglik_tolerance(end.result.cost, options)
-        name = f"{end.problem.windows.length:g} s windows{of}, continued"
-        stages[-1] = fitter.search(end.problem, end.result.x, tolerance, name)
+    # A guessed noise that is too large gives the priors too much weight.
+    guessed = len(stages) == 1 and noise < end.problem.noise_sd
+    if not end.stopped and (guessed or (skipped and end.result.status == "max_steps")):
+        # The step limit may have ended a stage that was only to start the next one.
+        problem = replace(end.problem, noise_sd=noise) if guessed else end.problem
+        tolerance = loglik_tolerance(float(problem.cost(end.result.x)), options)
+        name = f"{problem.windows.length:g} s windows{of}, continued"
+        stages[-1] = fitter.search(problem, end.result.x, tolerance, name)
     return Continuation(tuple(stages), skipped, reason)
 
 
