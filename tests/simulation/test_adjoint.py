@@ -155,7 +155,7 @@ def test_parameters_changed_after_the_forward_pass_are_refused():
 
 @pytest.mark.parametrize("power", [1, 2])
 def test_second_derivatives_are_refused(power):
-    """Those of a linear loss would otherwise be zero, as the gradient has no graph."""
+    """Otherwise a linear loss would give a Hessian of zero, as its gradient has no graph."""
     q0 = Q0.clone().requires_grad_()
     out = rollout(CHAIN, neurofuzzy(), q0, QD0, steps=3)
     with pytest.raises(RuntimeError, match="first order only"):
