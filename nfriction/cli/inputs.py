@@ -98,7 +98,9 @@ def law(text: str) -> str:
 
 def law_words(name: str) -> list[str]:
     """Words of a command line that name the file of a law; none for a law of this package."""
-    return ["--law", _SOURCES[name]] if name in _SOURCES else []
+    # Inputs add to the name of a law.
+    own = [text for law, text in _SOURCES.items() if name == law or name.startswith(f"{law}_by_")]
+    return ["--law", own[0]] if own else []
 
 
 def rig(text: str) -> str:

@@ -178,7 +178,10 @@ def _read(plant: Plant, sessions: Mapping[str, Session]) -> Iterator[Recording]:
                 recordings = Recording.many(session, plant=plant)
             except (ValueError, OSError):
                 continue
-        yield from (recording._replace(name=f"session {label}") for recording in recordings)
+        # Repeats within a session are a matter of its fit.
+        for recording in {r.digest(): r for r in recordings}.values():
+            name = f"{recording.name or 'a recording'} of session {label}"
+            yield recording._replace(name=name)
 
 
 def _fit_session(

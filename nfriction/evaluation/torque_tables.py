@@ -361,6 +361,7 @@ def fit_torque(
         name, why = _choose(shown or of, UNRESOLVED * float(np.abs(given.joints[k].tau).max()))
         hidden = ", ".join(plain_name(c.name) for c in of if c not in shown)
         if not shown:
+            why = "the speeds distinguish no laws"
             listed = ", ".join(f"{x:.3g}" for x in speeds)
             alike = "dry and viscous friction" if len(speeds) == 1 else "several laws"
             remarks.append(

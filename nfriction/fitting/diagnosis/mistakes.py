@@ -397,7 +397,8 @@ def _held(plant: Plant, given: Samples) -> Iterator[Mistake]:
     torque, speed = data.mean(data.tau - needed).abs(), data.mean(data.qd.abs())
     number, time = (data.mean(x.to(data.q))[:, 0] for x in (data.number, data.time))
     for j in data.driven:
-        slow = speed[:, j] < ALIKE**2 * speed[:, j].max()
+        # A joint that turns one way slides, however slowly.
+        slow = (speed[:, j] < ALIKE**2 * speed[:, j].max()) & (data.moving[:, j] == 0)
         change = (slow[1:] != slow[:-1]) | (number[1:] != number[:-1])
         runs = torch.arange(len(slow)).tensor_split(change.nonzero().flatten() + 1)
         rests = [run for run in runs if slow[run[0]] and len(run) >= FEWEST_BLOCKS]
@@ -410,8 +411,9 @@ def _held(plant: Plant, given: Samples) -> Iterator[Mistake]:
         most = max(given.options.diagnosis_ratio * usual, *others)
         for run in rests:
             # The torque of inertia is not certain.
-            held = (held := torque[run, j] - inertial[run, j])[held > most]
-            if len(held) >= FEWEST_BLOCKS:
+            against = torque[run, j] - inertial[run, j]
+            against = against[against > most]
+            if len(against) >= FEWEST_BLOCKS:
                 first, last, k = time[run[0]], time[run[-1]], number[run[0]]
                 # With the shocks at its ends, which smoothing spreads.
                 near = (given.time - (first + last) / 2).abs() < (last - first) / 2 + edge
@@ -419,7 +421,7 @@ def _held(plant: Plant, given: Samples) -> Iterator[Mistake]:
                 of = f"{plant.joint_names[j]} of {names_of(data.recordings)[int(k)]}"
                 said.append(
                     f"{of} rests from {first:.3g} to {last:.3g} s against "
-                    f"{held.median():.2g} {plant.effort_unit} and slides against {usual:.2g}"
+                    f"{against.median():.2g} {plant.effort_unit} and slides against {usual:.2g}"
                 )
     if said:
         causes = (

@@ -273,9 +273,8 @@ def gain_warnings(
 ) -> Iterator[tuple[str, bool]]:
     """A sentence for each torque gain that matters, and whether the friction is doubtful.
 
-    A gain matters if its whole interval takes a coefficient of torque out of its own. Where there
-    are no such intervals, as with networks, it is named beyond its prior's standard deviation, and
-    doubtful beyond 95 %.
+    A gain matters if its whole interval takes a coefficient of torque out of its own, or beyond its
+    prior's standard deviation; only then is the friction doubtful, as drives differ by less.
     """
     sd, law = problem.options.gain_term[1], problem.friction.law.coefficients
     for one in intervals:
@@ -286,15 +285,14 @@ def gain_warnings(
         own = {f"{c.name} of {joint}" for c in law if c.unit.startswith("N")}
         friction = [i for i in intervals if i.name in own]
         least = 1 + min(one.low, one.high, key=abs)
-        doubtful = any(not i.low <= i.value * least <= i.high for i in friction)
-        doubtful |= not friction and abs(one.value) > identifiability.NORMAL_95 * sd
-        if doubtful or (not friction and abs(one.value) > sd):
+        out = any(not i.low <= i.value * least <= i.high for i in friction)
+        scale, far = f"{1 / (1 + one.value):.3g}", abs(one.value) > sd
+        if far or (out and scale != "1"):
             text = (
-                f"Torques of {joint} are recorded {1 / (1 + one.value):.3g} times as large as "
-                "those of the other joints (torque constant, gear ratio, unit), and its friction "
-                "with them."
+                f"Torques of {joint} are recorded {scale} times as large as those of the other "
+                "joints (torque constant, gear ratio, unit), and its friction with them."
             )
-            yield text, doubtful
+            yield text, far
 
 
 def rotor_warning(
