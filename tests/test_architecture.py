@@ -273,7 +273,7 @@ def test_version_is_defined_once() -> None:
 # Size of the package today: a ratchet, lowered where code goes and raised only beside features that
 # the changelog names. The aims are 26,500 lines, 21,000 without the papers, in 150 files, and 1,800
 # lines for the story below.
-MOST_LINES, MOST_LINES_OF_THE_CORE, MOST_FILES = 45_052, 36_981, 191
+MOST_LINES, MOST_LINES_OF_THE_CORE, MOST_FILES = 45_053, 36_982, 191
 MOST_FILES_OF_A_FOLDER = 12
 # The nine files that explain how a recording becomes a scored model, in the order of the README.
 STORY = (

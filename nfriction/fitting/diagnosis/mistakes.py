@@ -93,8 +93,8 @@ def likely_mistakes(
     held = [*_held(plant, given)] if given.driven else []
     found = held if zeroed else held + unlike
     if noise < stated:
-        least = min((x.unexplained for x in held + unlike), default=math.inf)
-        found = found + _above_noise(plant, convention, given, least, presliding)
+        known = min((x.unexplained for x in held + unlike), default=math.inf)
+        found = found + _above_noise(plant, convention, given, known, presliding)
     if not found and not given.tau.any():
         # With a slightly wrong rig, the energy would seem to rise.
         rig = _with_usual_errors(plant, given)
@@ -107,11 +107,12 @@ def likely_mistakes(
 
 
 def _above_noise(
-    plant: Plant, convention: AngleConvention, given: Samples, least: float, presliding: bool
+    plant: Plant, convention: AngleConvention, given: Samples, known: float, presliding: bool
 ) -> list[Mistake]:
     """Mistakes whose correction divides the unexplained torque by `diagnosis_ratio`, simple first.
 
-    `least` is the share that different encoder zeros of the recordings, or no rests held, leave.
+    `known` is the share unexplained with an encoder zero for each recording, or without rests that
+    a brake holds.
     """
     stated, options = unexplained_share(plant, given), given.options
     sound, noise = stated, options.diagnosis_ratio * noise_share(plant, given, given.sd_of_mean)
@@ -139,7 +140,7 @@ def _above_noise(
     if sound <= noise:
         return []
     if len(given.recordings) > 1:
-        most = min(sound, least) / options.diagnosis_ratio
+        most = min(sound, known) / options.diagnosis_ratio
         tested += _odd_one_out(plant, convention, given.source, most)
     most = sound / options.diagnosis_ratio
     # Near one position a spring is like gravity, and a ratio like a unit.
